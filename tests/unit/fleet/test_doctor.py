@@ -14,6 +14,7 @@ from edge.core.vehicle import Gps
 from edge.flight.margins import ErrorBudget
 from edge.identity.card import Role
 from edge.messages.codes import CheckCode, FailedCheck
+from lpac.fleet import laptop
 from lpac.fleet.cards import init, open_authority
 from lpac.fleet.doctor import (
     ClockOffset,
@@ -472,6 +473,58 @@ def test_what_a_stopped_robots_release_says_counts(config: FleetConfig) -> None:
     assert "EKF2_HGT_REF = 3" in checks["failsafe"].found
     assert checks["preflight"].verdict == "warning"
     assert checks["preflight"].found == "no heading"
+
+
+LAPTOP = {
+    "rsync --version": "rsync  version 3.1.2  protocol version 31",
+    "ssh -V": "OpenSSH_9.2p1, of a laptop",
+    "-F /lab/ssh_config -G 192.168.8.11": "identityfile KEY",
+    "sleep.target": "LoadState=masked",
+    "suspend.target": "LoadState=masked",
+    "timedatectl": "yes",
+    "nft": '{"nftables": []}',
+    "iptables": "-P INPUT ACCEPT",
+}
+
+
+@pytest.mark.parametrize(
+    ("said", "name", "verdict", "found"),
+    [
+        ({}, "tools", "ok", "OpenSSH_9.2p1, rsync 3.1"),
+        ({"rsync --version": "rsync  version 3.0.9"}, "tools", "FAILED", "older than 3.1"),
+        ({}, "keys", "ok", "KEY, no agent"),
+        ({"ssh-keygen -y": ""}, "keys", "FAILED", "KEY has a passphrase"),
+        ({}, "sleep", "ok", "sleep.target and suspend.target are masked"),
+        ({"suspend.target": "LoadState=loaded"}, "sleep", "warning", "it may sleep"),
+        ({}, "clock", "ok", "set by a time server"),
+        ({"timedatectl": "no"}, "clock", "warning", "no time server has set it"),
+        ({}, "firewall", "ok", "nothing that blocks TCP port 7447"),
+        ({"iptables": "-P INPUT DROP"}, "firewall", "FAILED", "it blocks input of TCP port 7447"),
+        ({"iptables": "", "nft": ""}, "firewall", "skipped", "neither nft nor iptables"),
+    ],
+)
+def test_a_laptop(
+    config: FleetConfig, monkeypatch: pytest.MonkeyPatch,
+    said: dict[str, str], name: str, verdict: str, found: str,
+) -> None:  # fmt: skip
+    """By what its programs print; what prints "" ends with an error."""
+    key = config.path.with_name("KEY")
+    key.touch()
+
+    def run(*command: str) -> tuple[int, str]:
+        asked = " ".join(command)
+        text = next((text for part, text in (LAPTOP | said).items() if part in asked), "\n")
+        return (0 if text else 1), text.replace("KEY", str(key))
+
+    monkeypatch.setattr(laptop, "_run", run)
+    monkeypatch.setattr("shutil.which", lambda program: program)
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    monkeypatch.delenv("SSH_AUTH_SOCK", raising=False)
+    checked = laptop.examine_laptop(dataclasses.replace(config, ssh=SshConfig("/lab/ssh_config")))
+    (check,) = (check for check in checked if check.name == name)
+    assert check.verdict == verdict and found in check.found
+    assert bool(check.fix) == (verdict in ("FAILED", "warning"))
 
 
 def test_rsync_version() -> None:

@@ -5,7 +5,9 @@ import hashlib
 import json
 import stat
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import example, given
@@ -13,7 +15,7 @@ from hypothesis import strategies as st
 
 from edge.drivers.px4 import raw_mavlink
 from lpac.fleet.enroll import _predecessors_step
-from lpac.fleet.on_robot import enrolment, probes, releases, service, signatures
+from lpac.fleet.on_robot import collection, enrolment, probes, releases, service, signatures
 from lpac.fleet.on_robot.calls import Refused, write_whole
 from lpac.fleet.release import _entry
 from tests.conftest import ROOT
@@ -131,9 +133,143 @@ def test_the_programs_word_counts_while_it_has_the_vehicle(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     heartbeat = None if heard is None else {"armed": heard}
-    monkeypatch.setattr(service, "service", lambda: {"active": "active", "status": status})
     monkeypatch.setattr(service, "hear_heartbeat", lambda _: heartbeat)
-    assert service.armed(14551) is armed
+    for active in ("active", "reloading", "deactivating"):
+        state = {"active": active, "status": status}
+        monkeypatch.setattr(service, "service", lambda state=state: state)
+        assert service.armed(14551) is armed
+    # What a program said that has ended is no word of now.
+    monkeypatch.setattr(service, "service", lambda: {"active": "failed", "status": status})
+    assert service.armed(14551) is bool(heard)
+
+
+PORT = 14551
+NEEDS_LOCK: tuple[Callable[[str], object], ...] = (
+    lambda folder: releases.prepare(folder, "r", 0, "i", PORT),
+    lambda folder: releases.switch(folder, "r", PORT),
+    lambda folder: releases.rollback(folder, PORT),
+    lambda folder: enrolment.set_card({}, False, PORT),
+    lambda folder: enrolment.set_group_keys("", PORT),
+    lambda folder: enrolment.set_up_px4(folder, "", PORT, 1, "", 9.0, 0.5),
+)
+GROUNDED: tuple[Callable[[str], object], ...] = (
+    *NEEDS_LOCK,
+    lambda folder: enrolment.set_vision_hub(PORT),
+    lambda folder: enrolment.retire(["old"], PORT),
+    lambda folder: service.stop(PORT, in_flight=False, disable=False),
+    lambda folder: service.restart(folder, PORT, in_flight=False),
+    lambda folder: probes.set_clock(0.0, PORT),
+    lambda folder: collection.collect(folder, PORT, None, 0.0),
+)
+
+
+@pytest.mark.parametrize("call", GROUNDED)
+def test_a_robot_in_flight_is_left_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, call: Callable[[str], object]
+) -> None:
+    hub, running = tmp_path / "hub.conf", {"active": True, "enabled": True}
+    hub.write_text("{}")
+    monkeypatch.setattr(service, "armed", lambda _: True)
+    monkeypatch.setattr(releases, "_lock", [0])
+    monkeypatch.setattr(probes, "VISION_HUB", str(hub))
+    monkeypatch.setattr(probes, "known_containers", lambda: [])
+    monkeypatch.setattr(enrolment, "_unit", lambda _: running)
+    monkeypatch.setattr(enrolment, "_MEMBERSHIP", str(tmp_path / "identity"))
+    with pytest.raises(Refused, match="the vehicle is armed"):
+        call(str(tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["hub.conf"] and hub.read_text() == "{}"
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        *NEEDS_LOCK,
+        lambda folder: releases.discard(folder, "r"),
+        lambda folder: releases.accept(folder, "r"),
+        lambda folder: releases.sign(folder, "r", None),
+        lambda folder: releases.prove(folder, "r"),
+        probes.vehicle_check,
+    ],
+)
+def test_who_does_not_hold_the_robot_changes_nothing(
+    tmp_path: Path, call: Callable[[str], object]
+) -> None:
+    with pytest.raises(RuntimeError, match="lock was not called"):
+        call(str(tmp_path))
+
+
+def test_a_signature_counts_if_it_is_as_new_as_any_before(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("AUTHORITY", "_NEWEST", "_NEXT"):
+        monkeypatch.setattr(signatures, name, str(tmp_path / "etc" / name))
+    newest, release = tmp_path / "etc" / "_NEWEST", tmp_path / "release"
+    release.mkdir()
+    signatures.sign(str(release), None)  # Of a robot that knows no authority.
+    signatures.trust_authority(b"ours")
+    with pytest.raises(Refused, match="is not signed"):
+        signatures.sign(str(release), None)
+    for number in (7, 7, 6, 8):
+        monkeypatch.setattr(signatures, "_number", lambda *_, number=number: number)
+        signatures.require_signed(str(release), forward=False)
+        if number == 6:
+            older = "older than one that the robot has had"
+            with pytest.raises(Refused, match=older):
+                signatures.sign(str(release), "6")
+            with pytest.raises(Refused, match=older):
+                signatures.require_signed(str(release), forward=True)
+            assert (release / "signature.pem").read_text() == "7"
+            continue
+        signatures.sign(str(release), str(number))
+        assert newest.read_text() == f"{number}\n"
+    signatures.trust_authority(b"ours")
+    assert newest.read_text() == "8\n"
+    signatures.trust_authority(b"another")
+    assert newest.read_text() == "0\n"
+
+
+@pytest.mark.parametrize(
+    ("at", "problem", "known_s"),
+    [
+        (lambda s: {}, None, 2.0),
+        (lambda s: {"failures": int(s > 1.0)}, "its control loop fails", 40.25),
+        (lambda s: {"ticks": 5}, "its control loop does not tick", 40.25),
+        (lambda s: {"link": False}, "the radio link is not open", 40.25),
+        (lambda s: {"fresh": False}, "the program says nothing", 40.25),
+        (lambda s: {"active": "failed"}, "the unit is failed", 0.0),
+        # One restart is no fault, if it is well then; again and again it is.
+        (lambda s: {"nonce": int(s >= 1.0), "restarts": int(s >= 1.0)}, None, 3.0),
+        (lambda s: {"nonce": int(s), "restarts": int(s)}, "its control loop does not tick", 2.0),
+    ],
+)
+def test_a_program_is_well_once_its_loops_have_ticked_for_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+    at: Callable[[float], dict[str, Any]],
+    problem: str | None,
+    known_s: float,
+) -> None:
+    clock_s = [0.0]
+
+    def state() -> dict[str, Any]:
+        usual = {"failures": 0, "ticks": clock_s[0], "link": True, "fresh": True,
+                 "active": "active", "nonce": 0, "restarts": 0}  # fmt: skip
+        now = usual | at(clock_s[0])
+        loop = {"failures": now["failures"], "ticks": now["ticks"]}
+        status = {"link": now["link"], "boot_nonce": now["nonce"], "loops": {"control": loop}}
+        return {key: now[key] for key in ("active", "fresh", "restarts")} | {
+            "result": "", "status": status
+        }  # fmt: skip
+
+    def sleep(duration_s: float) -> None:
+        clock_s[0] += duration_s
+
+    monkeypatch.setattr(service, "service", state)
+    monkeypatch.setattr(service, "_reason", lambda: "see the logs")
+    monkeypatch.setattr("time.monotonic", lambda: clock_s[0])
+    monkeypatch.setattr("time.sleep", sleep)
+    found = service.unhealthy()
+    assert found is None if problem is None else str(found).startswith(problem)
+    assert clock_s[0] == known_s
 
 
 def test_a_container_engine_that_is_silent_keeps_nobody_from_being_enrolled(
