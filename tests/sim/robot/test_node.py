@@ -102,6 +102,11 @@ def test_what_it_publishes_and_logs_in_ten_seconds_of_flight() -> None:
     )
     assert 0.0 < logged["received"]["age_s"] < 0.1
     assert said.remote_control is None, "there is none to lose"
+    # Its neighbour hears the same.
+    (beacon,) = (heard.beacon for heard in other._inbox.peers(field.now_s))
+    assert (beacon.state, beacon.armed, beacon.system_id) == (said.state, True, said.system_id)
+    assert beacon.gps_accuracy_m == pytest.approx(said.gps_accuracy_m, abs=0.01)
+    assert beacon.flown_s == pytest.approx(said.flown_s, abs=1.0)
     # Neither beacon nor map is taken from somebody else than it names.
     other.subscriptions[MESSAGE]("robot/5/message", last["message"])
     other.control_step()

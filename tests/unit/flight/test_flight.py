@@ -1643,6 +1643,11 @@ def test_a_vehicle_that_leaves_offboard_is_not_fought_for(world: World) -> None:
     world.run(10.0)
     assert world.state() is FlightState.PILOT
     assert world.mode is Mode.RETURN
+    # Once it is down PX4 would not arm in that mode.
+    world.position_m[2], world.armed = 0.0, False
+    world.until(FlightState.LANDED, 2.5)
+    world.run(3.0)
+    assert world.asked(Action.HOLD) == 1
 
 
 def test_the_autopilot_falls_silent_and_answers_again(world: World) -> None:
@@ -1827,9 +1832,9 @@ def test_a_landing_that_the_autopilots_failsafe_holds_for_a_minute_is_asked_for_
 ) -> None:
     world.hover()
     world.enable(safety_action="land")
-    world.run(4.0)
+    world.run(10.0)
     world.failsafe = Mode.HOLD
-    world.run(50.0)
+    world.run(54.0)
     assert world.mode is Mode.HOLD
     world.until(FlightState.LANDED, 30.0)
 

@@ -163,6 +163,8 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         "mission origin is not set: set it on the ground",
     ),
     ({"position_m": None}, _C.PLACE_NOT_KNOWN, "place in the fence is not known"),
+    # From nowhere there is nothing to look at.
+    ({"position_m": None, "has_answer": False}, _C.PLACE_NOT_KNOWN, "place in the fence is not"),
     (
         {"position_m": (1.0, 8.0, 0.0)},
         _C.STANDS_OUTSIDE,
@@ -209,6 +211,26 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         {"min_separation_m": 5.0},
         _C.HEIGHTS_TOO_NEAR,
         "robot 2 flies 4.5 m above or below, must be 5 m (min_separ",
+    ),
+    (
+        {"min_separation_m": 8.05, "slot_height_m": 20.0},
+        _C.LANDINGS_TOO_NEAR,
+        "robot 2 lands 8.0 m away, must be 8.05 m (min_separ",
+    ),
+    # Where it stands by another origin tells nothing.
+    (
+        {
+            "neighbours": (
+                HeardBeacon(
+                    dataclasses.replace(
+                        NEIGHBOUR, frame_id=7, armed=False, position_m=(8.0, 8.0, 0.0)
+                    ),
+                    99.8,
+                ),
+            )
+        },
+        _C.OTHER_ORIGIN,
+        "robot 2 has another mission origin",
     ),
 ]
 DOUBTFUL = PositionJudgement(PositionQuality.DOUBTFUL, PositionCause.GLITCH)
@@ -262,6 +284,7 @@ VEHICLES: list[tuple[dict[str, Any], CheckCode, str]] = [
         "GPS precision (HDOP) is nan, must be at most 2",
     ),
     ({"battery": None}, _C.BATTERY_NOT_KNOWN, "battery is not known: check the power module"),
+    ({"battery": math.nan}, _C.BATTERY_LOW, "battery has nan %, must have 50 %"),
     ({"battery": 0.3}, _C.BATTERY_LOW, "battery has 30 %, must have 50 %: charge or change it"),
     (
         {"armable": False, "problems": (AutopilotReason("check_mag_missing", (0,), "no mag"),)},
@@ -309,6 +332,15 @@ def test_what_settles_under_open_sky_is_marked() -> None:
         _C.ESTIMATOR_ORIGIN_NOT_KNOWN, _C.HEADING_NOT_KNOWN, _C.GPS_NO_FIX,
         _C.GPS_FEW_SATELLITES, _C.GPS_IMPRECISE, _C.TIME_NOT_KNOWN, _C.NO_FRESH_ANSWER,
     }  # fmt: skip
+    # A policy that is broken does not mend itself; and what somebody has to do comes first.
+    broken: dict[str, Any] = {"has_answer": False, "answer_problem": "it raises"}
+    no_fix = dataclasses.replace(VEHICLE, gps=Gps(2, 14, 0.8))
+    failed = failed_checks(
+        dataclasses.replace(READY, vehicle=no_fix, **broken, origin=None), LIMITS
+    )
+    assert [(each.code, each.settles_by_itself) for each in failed] == [
+        (_C.NO_FRESH_ANSWER, False), (_C.ORIGIN_NOT_SET, False), (_C.GPS_NO_FIX, True),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("change", "code", "said"), INPUTS)

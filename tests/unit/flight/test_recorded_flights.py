@@ -190,6 +190,17 @@ def test_a_difference_is_told_once_with_its_times() -> None:
     reason = next(d.differing for d in replay.differences if d.differing.what == "reason")
     assert reason.then == "ground_lost: ground lost"
     assert replay.differing == 2 and replay.ticks == len(messages)
+    assert replay.began_unix_s == messages[0][1]
+
+
+def test_what_guidance_remembers_is_compared_too() -> None:
+    replay = FlightReplay()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(guidance, "keep_inside", lambda *given: (given[3], False))
+        for _, unix_time_s, message in read(RECORDED / "wind_over_the_fence.mcap", "flight"):
+            replay.run(unix_time_s, message)
+    told = {d.differing.what for d in replay.differences}
+    assert {"guidance: velocity", "guidance: recovering"} <= told
 
 
 def test_a_tick_is_what_it_was_after_the_log() -> None:
@@ -209,6 +220,9 @@ def test_after_a_gap_it_goes_on_with_the_next_whole_message() -> None:
     assert [m["whole"] for m in messages].count(True) == len(messages) // 100 + 1
     first_whole = 100 - 3 - 1
     assert not any(read_again[:first_whole]) and all(read_again[first_whole:])
+    reader = TickReader()
+    read_again = [reader.tick(m) is not None for m in (*messages[:40], *messages[41:])]
+    assert all(read_again[:40]) and not any(read_again[40:99]) and all(read_again[99:])
 
 
 def test_what_is_no_tick_is_one_line() -> None:

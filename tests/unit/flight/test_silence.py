@@ -16,6 +16,7 @@ from edge.flight.silence import (
     highest_still_m,
     last_word,
     nearest_on_way_m,
+    stops_m,
     strays_m,
 )
 from edge.messages.beacon import Beacon
@@ -35,8 +36,9 @@ def test_it_is_where_it_said_and_as_high_as_it_was_to_climb() -> None:
     assert said is not None
     assert (said.position_m, said.velocity_m_s) == ((3.0, 4.0, 9.0), (1.0, 0.0, 0.0))
     for state in (FlightState.ARMING, FlightState.TAKEOFF, FlightState.RETURN):
-        climbs = last_word(replace(FLYING, state=state, slot_height_m=14.0), LIMITS)
-        assert climbs is not None and climbs.position_m == (3.0, 4.0, 14.0)
+        for slot_height_m, height_m in ((14.0, 14.0), (5.0, 9.0)):
+            climbs = last_word(replace(FLYING, state=state, slot_height_m=slot_height_m), LIMITS)
+            assert climbs is not None and climbs.position_m == (3.0, 4.0, height_m)
 
 
 @pytest.mark.parametrize(
@@ -67,13 +69,15 @@ def test_it_is_down_when_it_must_have_come_down() -> None:
 def test_it_may_have_stopped_anywhere_on_its_way(x_m: float, y_m: float, age_s: float) -> None:
     said = last_word(FLYING, LIMITS)
     assert said is not None
+    apart_m = np.hypot(*np.diff(stops_m(said._replace(age_s=age_s), LIMITS), axis=0).T)
+    assert (apart_m <= 2.0 + 1e-9).all()
     place_m = np.array([x_m, y_m])
     near_m = nearest_on_way_m(said._replace(age_s=age_s), LIMITS, place_m)
-    stops_m = np.array([3.0, 4.0]) + np.outer(
+    way_m = np.array([3.0, 4.0]) + np.outer(
         np.linspace(0.0, min(age_s, LIMITS.flies_on_s), 101), [1.0, 0.0]
     )
     assert np.hypot(*(near_m - place_m)) == pytest.approx(
-        np.hypot(*(stops_m - place_m).T).min(), abs=0.03
+        np.hypot(*(way_m - place_m).T).min(), abs=0.03
     )
 
 

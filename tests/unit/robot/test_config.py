@@ -150,6 +150,7 @@ def test_relative_paths_are_meant_from_the_files_folder(
         ("# [rates]", "[rates]\ncontrol_hz = 2.0", ["rates: control_hz = 2.0", "4 Hz"]),
         ("# [rates]", "[rates]\npolicy_hz = inf", ["rates: policy_hz = inf", "0.1 to 100"]),
         ("# [log]", "[log]\nmax_total_mb = 5", ["log: max_total_mb = 5", "50 or more"]),
+        ("# [reach]", "[reach]\nceiling_m = 0.0", ["reach: ceiling_m = 0.0: must be above 0"]),
         ("# [log]", "[[log]]", ["log", "expected a table"]),
         ("# payload", 'payload = "int4" #', ["policy: payload = 'int4'", "'float16', 'int8'"]),
         ("# env_scale = 16.0", "env_scale = 0.0", ["policy: env_scale = 0.0"]),
