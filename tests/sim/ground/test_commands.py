@@ -74,6 +74,14 @@ def test_a_hold_on_the_ground_is_not_withdrawn_by_takeoff(by: str) -> None:
     assert field.states() == {_S.HOLD}
 
 
+def test_who_takes_the_command_says_whose_hold_it_is() -> None:
+    field = two_stations(1)
+    field.done(SafetyCommand("hold"))
+    field.done(TakeCommand(), "bob")
+    state = field.stations["bob"].state
+    assert state is not None and (state.safety_action, state.safety_action_by) == ("hold", "alice")
+
+
 def test_a_hold_of_one_robot_is_not_withdrawn_with_the_landing_of_others() -> None:
     field = two_stations(3)
     field.done(SafetyCommand("hold", robots=("r1",)), "bob")

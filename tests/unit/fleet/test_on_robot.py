@@ -313,3 +313,31 @@ def test_a_benchmark_that_something_else_disturbed_is_run_again(
     else:
         with pytest.raises(Refused, match="too slow"):
             releases.prove("", "a")
+
+
+def test_a_signature_is_the_authoritys_and_of_this_very_release(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """By what OpenSSL says of it, which looks at no clock."""
+    (tmp_path / "manifest.json").write_bytes(b"{}")
+    (tmp_path / "signature.pem").write_text("a certificate")
+    digest = hashlib.sha256(b"{}").hexdigest()
+
+    def number(subject: str = digest, code: int = 0) -> int:
+        def run(command: list[str]) -> subprocess.CompletedProcess[str]:
+            assert {"verify", "-no_check_time", signatures.AUTHORITY} <= set(command)
+            return subprocess.CompletedProcess(command, code, "", "error 20: unable to verify")
+
+        monkeypatch.setattr(signatures, "run", run)
+        said = f"serial=1A\nsubject=CN={subject},O=LPAC fleet demo\n"
+        monkeypatch.setattr(signatures, "must", lambda _: said)
+        return signatures._number(str(tmp_path), str(tmp_path / "signature.pem"))
+
+    assert number() == 0x1A
+    for refused, match in (
+        ({"code": 2}, "not the fleet's authority's: error 20"),
+        ({"subject": 64 * "0"}, "is another release's"),
+        ({"subject": "robot-1"}, "a certificate for something else"),
+    ):
+        with pytest.raises(Refused, match=match):
+            number(**refused)

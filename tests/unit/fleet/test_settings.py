@@ -210,6 +210,10 @@ def with_router(place: str) -> str:
     return example("# [radio]", f'[radio]\ntransport = "router"\nrouter = "{place}"\n')
 
 
+def test_robots_elsewhere_need_keys_though_their_router_is_here(tmp_path: Path) -> None:
+    assert load_fleet(fleet_file(tmp_path, with_router("127.0.0.1:7447"))).keys is not None
+
+
 def test_robots_of_this_computer_need_keys_if_their_router_is_elsewhere(tmp_path: Path) -> None:
     here = re.sub(r"192\.168\.8\.(\d+)", r"127.0.0.\1", with_router("127.0.0.1:7447"))
     here = re.sub(r'host = "127\.0\.0\.(\d+)"', r'host = "127.0.0.\1"', here)
@@ -496,6 +500,18 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
             "flight = {min_separation_m = 9.5, slot_spacing_m = 10.0}",
             ["slots[1] (robot r2): pad_m", "is 9.0 m", "must be 9.5 m (min_separation_m)"],
         ),
+        (
+            "[robots.r2.robot.limits]",
+            "[robots.r2.robot]\nflight.min_separation_m = 9.5\nflight.slot_spacing_m = 10.0\n"
+            "[robots.r2.robot.limits]",
+            ["slots[1] (robot r2): pad_m", "is 9.0 m", "must be 9.5 m (min_separation_m)"],
+        ),
+        (
+            "[robots.r2.robot.limits]",
+            "[robots.r2.robot]\nflight.min_separation_m = 9.0\nflight.slot_spacing_m = 10.0\n"
+            "flight.base_height_m = 3.5\n[robots.r2.robot.limits]",
+            ["height = 1: is 13.5 m, 8.5 m from that of", "must be 9 m (min_separation_m)"],
+        ),
         ("buffer_m = 1.5", "buffer_m = 1.0", ["robots.r1, in slots[0]: buffer_m = 1: must be 1.3"]),
         ("[robot]\n#", "[[robot]]\n#", ["robot = [{", "expected a table"]),
         ("[[slots]]\nrobot = \"r1\"", "[slots]", ["no TOML"]),
@@ -663,6 +679,9 @@ def test_a_robot_is_added_and_nothing_else_changes(tmp_path: Path) -> None:
     added = path.read_bytes()
     add_robot(path, "r12", "drone12", 12, user="voxl", port=2222)
     assert path.read_bytes() == added
+    for other in ({"port": 22}, {"address": "10.0.0.13"}):
+        with pytest.raises(ConfigError, match="is there already"):
+            add_robot(path, "r12", "drone12", 12, user="voxl", **other)
 
 
 @pytest.mark.parametrize("ending", ["", "\n", "\n\n"])

@@ -38,6 +38,7 @@ from lpac.ground.station.protocol import (
     SetWorld,
     Start,
 )
+from lpac.ground.station.station import is_down
 from tests.conftest import ROOT
 from tests.unit.ground.snapshots import FENCE, ORIGIN, on_ground, setup, snapshot, status
 
@@ -176,6 +177,19 @@ def run(script: Path) -> tuple[Told, Heard, ScriptRun]:
     ground, heard = Told(), Heard()
     loaded = replace(load_script(script, Sites(script)), steps=())
     return ground, heard, ScriptRun(loaded, Sites(script), ground, heard)
+
+
+@pytest.mark.parametrize(
+    ("state", "armed", "down"),
+    [
+        (FlightState.IDLE, False, True), (FlightState.LANDED, None, True),
+        (FlightState.PREFLIGHT, True, False), (FlightState.LANDED, True, False),
+        (FlightState.FAULT, False, True), (FlightState.FAULT, None, False),
+        (FlightState.HOLD, False, False),
+    ],
+)  # fmt: skip
+def test_who_is_down(state: FlightState, armed: bool | None, down: bool) -> None:
+    assert is_down(status(0, state=state, armed=armed)) is down
 
 
 def test_who_flies_is_held_whoever_stands(run: tuple[Told, Heard, ScriptRun]) -> None:
