@@ -25,7 +25,7 @@ from lpac.sim.drill.campaign import Campaign, FlightOutcome, fly_order
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.field import DrilledRobots
 from lpac.train.rollout import ShardTask, fly_shard, plan_round
-from tests.command import called, error_line, lpac
+from tests.command import called, error_line
 from tests.conftest import SHIPPED
 from tests.training import here, read
 
@@ -117,7 +117,7 @@ def test_a_campaign_that_was_killed_goes_on(tmp_path: Path) -> None:
     # As if it was killed in the middle of a line.
     before = _lines(kept)[:2]
     kept.write_text("\n".join([*before, '{"fault": "lan']))
-    result = lpac("drill", *options, "--out", out, "--json")
+    result = called("drill", *options, "--out", out, "--json")
     assert result.returncode == 0, (result.stdout, result.stderr)
     assert _lines(kept)[:2] == before
     told = json.loads(result.stdout)

@@ -140,7 +140,7 @@ def cards_tell_nothing_of_a_new_program(monkeypatch: pytest.MonkeyPatch) -> None
         (watchdog_waits_5_s, "program-hangs", PAIR),
         (landing_points_swapped, "none", PAIR),
         (ground_tells_nothing_of_holds, "held", PAIR),
-        (without_brake, "somebody-over-the-pad", 3),
+        (without_brake, "somebody-over-the-pad", PAIR),
         (cards_tell_nothing_of_a_new_program, "ground-restarts", 4),
     ],
     ids=lambda each: getattr(each, "__name__", str(each)),

@@ -85,6 +85,7 @@ def test_it_draws_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     assert len(list((out / "worst" / DEFAULT_BUNDLE.name).glob("*.png"))) == 2
 
 
+@pytest.mark.usefixtures("sketched")
 def test_with_the_radio_that_a_field_had(tmp_path: Path) -> None:
     records = tmp_path / "field.jsonl"
     said = RadioRecord(
@@ -108,6 +109,7 @@ def test_with_the_radio_that_a_field_had(tmp_path: Path) -> None:
     assert told["wifi_from"]["frame_loss"] == {"kind": "delivered", "records": 1}
 
 
+@pytest.mark.usefixtures("sketched")
 def test_killed_and_with_a_full_disk_it_loses_nothing_and_goes_on(
     evaluated: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -131,7 +133,7 @@ def test_killed_and_with_a_full_disk_it_loses_nothing_and_goes_on(
     assert error_line(full) == "lpac: [Errno 27] File too large"
     before = [*before, *kept.read_text().splitlines()[1:-1]]
     assert len(before) > 1
-    result = lpac("evaluate", *PLAIN, "--out", tmp_path, "--json")
+    result = called("evaluate", *PLAIN, "--out", tmp_path, "--json")
     assert result.returncode == 0, (result.stdout, result.stderr)
     assert kept.read_text().splitlines()[: len(before)] == before
     assert json.loads(result.stdout)["conditions"] == evaluated[1]["conditions"][:1]
@@ -154,6 +156,7 @@ def test_interrupted_it_is_one_line(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("sketched")
 def test_whether_one_is_better(tmp_path: Path) -> None:
     """Clairvoyant against what stays where it sees something, over few seconds."""
     result = called(

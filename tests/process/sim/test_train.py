@@ -44,6 +44,7 @@ def until_there_is(pattern: str, out: Path, process: "subprocess.Popen[str]") ->
         time.sleep(0.02)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_killed_it_goes_on_and_comes_to_the_same(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
