@@ -1844,7 +1844,10 @@ def test_after_a_lapse_that_nobody_answers_it_lands(world: World) -> None:
     world.stop(3.0)
     began_s = world.now_s
     world.run(30.0)
-    world.stop(1.0)  # Another one is no answer.
+    world.stop(1.0)  # Another one is no answer, nor is what somebody else is told.
+    world.order = replace(world.new_order("reset"), robot_id=4)
+    world.tick()
+    world.order = None
     assert world.flight.alarming
     (alone,) = (a for a in world.tick().alarms if a.code is ReasonCode.HOVERS_ALONE)
     world.reads(alone, "hovers, and lands 60 s after it began to, if nobody orders or holds it")
@@ -2369,6 +2372,7 @@ CHANGES = (_order, _mode, _arm, _ground, _surroundings, _vehicle, _place, _stop)
         ({"min_separation_m": 4.5}, "min_separation_m = 4.5"),
         ({"battery_critical": 0.3}, "battery_critical = 0.3"),
         ({"slot": 20}, "slot = 20"),
+        ({"slot": 0, "base_height_m": 0.5}, "flies at 0.5 m: must be from floor_m = 1"),
         ({"landing_point_m": (1.0, 12.0)}, "buffer_m = 2"),
     ],
 )
