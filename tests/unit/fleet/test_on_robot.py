@@ -341,3 +341,34 @@ def test_a_signature_is_the_authoritys_and_of_this_very_release(
     ):
         with pytest.raises(Refused, match=match):
             number(**refused)
+
+
+@pytest.mark.parametrize(
+    ("active", "age_s", "fresh"),
+    [
+        ("active", 0.5, True),
+        ("active", 3.0, False),
+        ("active", -2.0, False),
+        ("active", None, False),
+        ("failed", 0.5, False),
+    ],
+)
+def test_a_programs_word_is_fresh_while_it_runs(
+    monkeypatch: pytest.MonkeyPatch, active: str, age_s: float | None, fresh: bool
+) -> None:
+    told = "" if age_s is None else json.dumps({"monotonic_s": 100.0 - age_s})
+    shown = f"ActiveState={active}\nStatusText={told}\nNRestarts=2\nUnitFileState=enabled\n"
+    monkeypatch.setattr(service, "must", lambda _: shown)
+    monkeypatch.setattr("time.monotonic", lambda: 100.0)
+    state = service.service()
+    assert (state["fresh"], state["active"]) == (fresh, active)
+    assert (state["restarts"], state["enabled"]) == (2, True)
+
+
+def test_a_datagram_is_for_the_port_that_it_is_sent_to() -> None:
+    header = bytes([0x45, *bytes(8), 17, *bytes(2), 127, 0, 0, 1, *bytes(4)])
+    packet = header + (14580).to_bytes(2) + (14551).to_bytes(2) + bytes(4) + b"beat"
+    assert service._datagram(packet, 14551) == b"beat"
+    assert service._datagram(packet, 14580) == b""
+    assert service._datagram(packet.replace(b"\x11", b"\x06", 1), 14551) == b""
+    assert service._sender(packet) == ("127.0.0.1", 14580)
