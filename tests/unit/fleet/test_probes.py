@@ -283,3 +283,13 @@ def test_ports_that_others_reach() -> None:
 @given(ANYTHING)
 def test_whatever_ss_prints_names_no_port_or_some(text: str) -> None:
     assert isinstance(probes.open_ports(text), list)
+
+
+def test_what_tools_seldom_print() -> None:
+    """A level that is no dBm, a network without an access point, a unit that starts, devices."""
+    assert probes.wireless("\n\n wlan0: 0000   54.   200.  0\n") == {"wlan0": None}
+    assert probes.iw_link("Joined IBSS 02:11:22:33:44:55 (on wlan0)\n")["connected"] is True
+    starting = "Id=a.service\nLoadState=loaded\nActiveState=activating\n"
+    assert probes.units(starting) == {"a": {"there": True, "active": True, "enabled": False}}
+    told = json.dumps([{"Name": "/box", "HostConfig": {"Privileged": True}}])
+    assert probes.containers(told)[0]["devices"]
