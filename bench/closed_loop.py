@@ -18,7 +18,8 @@ from bench.report import Report, Table, Target
 from edge.core.world import random_features
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.sim.baselines import BaselineName
-from lpac.sim.experiment import Scenario, fly
+from lpac.sim.experiment import fly
+from lpac.sim.scenario import Scenario
 
 LPAC, LOSSY = "lpac", "lpac, 30 % loss"
 RIVAL: BaselineName = "decentralized-cvt"

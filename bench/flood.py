@@ -24,8 +24,8 @@ from edge.drivers.identity_folder import load_identity
 from edge.messages.mission import FlightState
 from edge.messages.topics import TlsFiles
 from lpac.sim.fleet.flight import fly
-from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
+from lpac.sim.scenario import Scenario
 
 _RATE_HZ = 10_000
 _BURST_S = 0.01
@@ -96,7 +96,7 @@ def measure(mission_s: float = 70.0, rate_hz: int = _RATE_HZ) -> Report:
 
 def _fly(mission_s: float, rate_hz: int, *, secure: bool) -> Flooded:
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        scenario = FleetScenario(robots=2, seed=7, duration_s=mission_s, secure=secure)
+        scenario = Scenario(robots=2, seed=7, duration_s=mission_s, secure=secure)
         fleet = Fleet(scenario, Path(folder), BUNDLE)
         flood: _Flood | None = None
 

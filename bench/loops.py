@@ -24,8 +24,8 @@ from bench.usage import Usage, usage
 from edge.messages.mission import LoopStatus
 from lpac.analysis.logs import LoggedStatus
 from lpac.sim.fleet.flight import fly
-from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
+from lpac.sim.scenario import Scenario
 
 LOOPS = ("perception", "policy", "control")
 
@@ -146,7 +146,7 @@ def _fly(robots: int, mission_s: float, *, secure: bool = False) -> _Flight:
             looks.append((now_s, [usage(robot.pid) for robot in fleet.robots]))
 
     with tempfile.TemporaryDirectory() as folder:
-        scenario = FleetScenario(robots=robots, seed=7, duration_s=mission_s, secure=secure)
+        scenario = Scenario(robots=robots, seed=7, duration_s=mission_s, secure=secure)
         fleet = Fleet(scenario, Path(folder), BUNDLE)
         flight = fly(fleet, watch=watch)
     if flight.problem is not None:

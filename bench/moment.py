@@ -14,7 +14,7 @@ from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Manifest
 from edge.policy.family import Policy
 from edge.robot.pac import Pac, PacParameters
-from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.description import FIELD_SCALE
 from lpac.sim.medium import Medium
 from lpac.sim.swarm import pac_swarm
 from lpac.sim.ticks import Clocks

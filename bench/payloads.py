@@ -13,7 +13,8 @@ from rich.progress import track
 from bench import BUNDLE
 from bench.report import Report, Table, Target
 from edge.policy.bundle import load_bundle
-from lpac.sim.experiment import Scenario, fly
+from lpac.sim.experiment import fly
+from lpac.sim.scenario import Scenario
 
 _CORES = 2
 _TIMES = 10.0

@@ -18,8 +18,9 @@ from edge.core.coverage import coverage_cost
 from edge.core.world import GaussianFeature
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.sim.batch import BatchedFlights
-from lpac.sim.experiment import SAMPLE_S, SAMPLES_PER_COST, Scenario, prepare
+from lpac.sim.experiment import SAMPLE_S, SAMPLES_PER_COST, prepare
 from lpac.sim.experiment import fly as fly_exactly
+from lpac.sim.scenario import Scenario
 
 EXACT, BATCHED, REFERENCE = "exact", "batched", "CoverageControl"
 TWO_THREADS = "batched, 2 threads"

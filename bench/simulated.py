@@ -11,7 +11,7 @@ from bench import BUNDLE
 from bench.report import Report, Table, Target, progress
 from edge.core.logger import show
 from lpac.sim.fleet.clocked import fly_simulated
-from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.scenario import Scenario
 
 
 def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Report:
@@ -63,7 +63,7 @@ def _fly(robots: int, mission_s: float) -> dict[str, float]:
     gc.freeze()  # what is loaded stays
     with tempfile.TemporaryDirectory() as folder:
         wall_s, cpu_s = perf_counter(), process_time()
-        scenario = FleetScenario(robots=robots, seed=3, duration_s=mission_s)
+        scenario = Scenario(robots=robots, seed=3, duration_s=mission_s)
         flight = fly_simulated(scenario, Path(folder), BUNDLE)
         wall_s, cpu_s = perf_counter() - wall_s, process_time() - cpu_s
     if flight.problem is not None:

@@ -35,9 +35,10 @@ from lpac.analysis.flight import least_separation
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.station.protocol import Enable, Request, SetOrigin, Start, Takeoff
 from lpac.sim.description import ERRORS
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.radio import GROUND
+from lpac.sim.scenario import Scenario
 
 _CORES = 2
 _LIES_HZ = 20.0
@@ -170,7 +171,7 @@ class Thief:
 
 def ready_fleet(robots: int, seed: int, folder: Path) -> SimulatedFleet:
     """A fleet with keys, ready to take off. Raises RuntimeError if it does not get so far."""
-    fleet = SimulatedFleet(FleetScenario(robots=robots, seed=seed, secure=True), folder, BUNDLE)
+    fleet = SimulatedFleet(Scenario(robots=robots, seed=seed, secure=True), folder, BUNDLE)
     _until_all(fleet, lambda _: True)
     _do(fleet, SetOrigin(ORIGIN))
     _do(fleet, Enable())

@@ -98,16 +98,15 @@ if TYPE_CHECKING:
     from lpac.sim.batch import fly_batch as fly_batch
     from lpac.sim.cores import in_this_process as in_this_process
     from lpac.sim.cores import over_cores as over_cores
-    from lpac.sim.experiment import FIELD_SCALE as FIELD_SCALE
+    from lpac.sim.description import FIELD_SCALE as FIELD_SCALE
     from lpac.sim.experiment import FlightMoment as FlightMoment
-    from lpac.sim.experiment import Scenario as Scenario
     from lpac.sim.experiment import SimulatedFlight as SimulatedFlight
     from lpac.sim.experiment import fly as fly
     from lpac.sim.failure import Failure as Failure
     from lpac.sim.failure import LostRobots as LostRobots
     from lpac.sim.fleet.clocked import fly_simulated as fly_simulated
     from lpac.sim.fleet.flight import FleetFlight as FleetFlight
-    from lpac.sim.fleet.layout import FleetScenario as FleetScenario
+    from lpac.sim.scenario import Scenario as Scenario
     from lpac.sim.ticks import Clocks as Clocks
     from lpac.sim.vehicles import PointVehicles as PointVehicles
     from lpac.sim.vehicles import VehicleOdometry as VehicleOdometry
@@ -138,11 +137,12 @@ _TAKEN = {
     "lpac.shipped": "SHIPPED_BUNDLE",
     "lpac.sim.batch": "fly_batch",
     "lpac.sim.cores": "in_this_process over_cores",
-    "lpac.sim.experiment": "FIELD_SCALE FlightMoment Scenario SimulatedFlight fly",
+    "lpac.sim.description": "FIELD_SCALE",
+    "lpac.sim.experiment": "FlightMoment SimulatedFlight fly",
     "lpac.sim.failure": "Failure LostRobots",
     "lpac.sim.fleet.clocked": "fly_simulated",
     "lpac.sim.fleet.flight": "FleetFlight",
-    "lpac.sim.fleet.layout": "FleetScenario",
+    "lpac.sim.scenario": "Scenario",
     "lpac.sim.ticks": "Clocks",
     "lpac.sim.vehicles": "PointVehicles VehicleOdometry",
 }

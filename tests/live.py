@@ -8,10 +8,11 @@ from pathlib import Path
 from edge.messages.codec import decode, encode
 from edge.messages.mission import RobotStatus
 from edge.messages.topics import STATUS, Topic
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.live import LiveFleet
 from lpac.sim.fleet.robots import OpenLink, SimulatedRobot
 from lpac.sim.radio import Subscriptions
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 from tests.flown import PRECISE, QUICK, FlownRobot
 
@@ -35,8 +36,8 @@ class FlownFleet(LiveFleet):
     def __init__(self, folder: Path, n: int, *, spares: int = 0, name: str = "") -> None:
         self.says: dict[int, Callable[[RobotStatus], RobotStatus]] = {}
         pads_m = tuple((2.0 + 4.0 * (i % 8), 2.0 + 4.0 * (i // 8)) for i in range(n + spares))
-        scenario = FleetScenario(
-            robots=n + spares, seed=3, errors=False, budget=PRECISE, pads_m=pads_m
+        scenario = Scenario(
+            robots=n + spares, seed=3, errors=False, budget=PRECISE, starts_m=pads_m
         )
         super().__init__(
             scenario, folder, SHIPPED,

@@ -33,12 +33,13 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
-from lpac.sim.fleet.robots import Settings, SimulatedRobot
+from lpac.sim.fleet.layout import ORIGIN, Settings
+from lpac.sim.fleet.robots import SimulatedRobot
 from lpac.sim.fleet.simulated import SimulatedFleet
 from lpac.sim.px4.modes import MavResult, Px4Mode
 from lpac.sim.px4.vehicle import Px4Vehicle, SimulatedSensor
 from lpac.sim.radio import GROUND
+from lpac.sim.scenario import Scenario
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE, QUICK
 
@@ -54,7 +55,7 @@ class _Flight:
     """Two robots; what is done to them, of which robot 0's ticks are recorded from `began_s` on."""
 
     def __init__(self, folder: Path, settings: Settings) -> None:
-        scenario = FleetScenario(robots=2, seed=3, errors=False, budget=PRECISE)
+        scenario = Scenario(robots=2, seed=3, errors=False, budget=PRECISE)
         self.fleet = SimulatedFleet(
             scenario, folder, SHIPPED, settings={"rates": _RATES, **settings}, logs=True
         )

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from lpac.analysis.flight import FlightRecord
     from lpac.paper.asynchrony import TimingResult
     from lpac.sim.cores import Pool
-    from lpac.sim.experiment import Scenario, SimulatedFlight
-    from lpac.sim.fleet.layout import FleetScenario
+    from lpac.sim.experiment import SimulatedFlight
+    from lpac.sim.scenario import Scenario
 
 app = new_app("paper", "Repeat the paper's experiments, and run some that its arguments call for.")
 
@@ -300,7 +300,7 @@ def _beside_points(
 
 
 def _fly_whole(
-    plan: "Mapping[str, FleetScenario]",
+    plan: "Mapping[str, Scenario]",
     bundle: Path,
     vehicle: VehicleKind,
     px4: Path | None,
@@ -352,7 +352,6 @@ def e3(
         perturbed_by,
         whole_perturbation,
     )
-    from lpac.paper.flown import fly_piloted, fly_programs
     from lpac.paper.report import TAKEN_LOGS, TAKEN_POINTS, TAKEN_WHOLE, write_perturbation
 
     _check_options(vehicle, px4, logs, trial, world_file, {"--world": world, "--ray": ray})
@@ -373,18 +372,14 @@ def e3(
         [flight] = _fly([plan], flown_by, cores)
         what = perturbed(flight)
     else:
-        scenario, pilots = whole_perturbation(flown_by, world)
+        scenario = whole_perturbation(flown_by, world)
         made_by = _made_by(command, [flown_by], {"flight": scenario.seed})
         how = TAKEN_WHOLE.format(vehicles=_VEHICLES[vehicle])
         range_m = _range_m(flown_by)
         folder.mkdir(parents=True, exist_ok=True)
-        with progress_of("flights") as progress:
-            task = progress.add_task("", total=1)
-            if vehicle is VehicleKind.SIMULATED:
-                record = fly_piloted(scenario, flown_by, pilots)
-            else:
-                record = fly_programs(scenario, folder / "flight", flown_by, px4, pilots)
-            progress.update(task, advance=1)
+        [record] = _fly_whole(
+            {"flight": scenario}, flown_by, vehicle, px4, pool(None), folder
+        ).values()
         what = perturbed_by(record, absences_of(record), range_m)
     told = write_perturbation(what, folder, made_by, how)
     _tell(
@@ -403,7 +398,7 @@ def _range_m(path: Path, flown: "Sequence[str] | None" = None) -> float:
 
     Raises ValueError if it is none of `flown`, ids of bundles.
     """
-    from lpac.sim.experiment import FIELD_SCALE
+    from lpac.sim.description import FIELD_SCALE
 
     bundle = _bundle_that_flew(path, flown, "which says how far robots hear each other")
     perception = bundle.manifest.perception

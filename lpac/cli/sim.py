@@ -36,20 +36,17 @@ if TYPE_CHECKING:
     from edge.core.frames import ModelScale
     from edge.core.world import Feature
     from lpac.cli.live import FleetDisplay
-    from lpac.sim.experiment import FlightMoment, Scenario, SimulatedFlight
+    from lpac.sim.experiment import FlightMoment, SimulatedFlight
     from lpac.sim.failure import Failure
     from lpac.sim.fleet.flight import FleetFlight
-    from lpac.sim.fleet.layout import FleetScenario
     from lpac.sim.fleet.processes import Fleet
-    from lpac.sim.fleet.robots import Settings
+    from lpac.sim.scenario import Scenario
     from lpac.sim.ticks import Clocks
 
 app = new_app()
 
 DEFAULT_OUT = Path("out/sim")
 DEFAULT_ROBOTS = 10
-# In the folder of whole robots' flight: of the world's size, or the range, that was asked for.
-_OWN_BUNDLE = "bundle"
 # Images and actions count for so long, s, or for two periods, if that is longer.
 _INPUT_AGE_S = 1.0
 
@@ -275,7 +272,7 @@ def sim(
     from edge.core.counted import counted
     from edge.core.frames import ModelScale
     from edge.core.world import parse_world
-    from lpac.sim.experiment import FIELD_SCALE
+    from lpac.sim.description import FIELD_SCALE
 
     _require_options_of(context, vehicle, controller, world)
     count = _robot_count(robots, vehicle)
@@ -285,66 +282,11 @@ def sim(
     max_input_age_s = max(_INPUT_AGE_S, 2.0 * clocks.perception_s, 2.0 * clocks.policy_s)
     model = FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0)
     starts_m = None if starts is None else _starts(starts, count, bundle, world_size, model)
-    if vehicle is not VehicleKind.POINT:
-        from lpac.sim.fleet.layout import FleetScenario
-        from lpac.sim.fleet.own_bundle import bundle_with
-
-        flown: Literal["mavlink", "px4"] = "px4" if vehicle is VehicleKind.PX4 else "mavlink"
-        check_px4(vehicle, px4)
-        fleet_scenario = _sized(
-            FleetScenario(
-                robots=1 if count is None else count,
-                seed=seed,
-                duration_s=duration,
-                features=world_features,
-                random_feature_count=features,
-                errors=errors,
-                sensor=sensor,
-                secure=secure,
-                transport="mesh" if transport is None else transport.value,
-                pads_m=starts_m,
-            ),
-            count,
-            bundle,
-            flown,
-        )
-
-        settings: Settings = {
-            "rates": {
-                "perception_hz": perception_hz, "policy_hz": policy_hz, "control_hz": control_hz,
-            },
-            "policy": {
-                "max_message_age_s": max_message_age, "max_input_age_s": max_input_age_s,
-            },
-        }  # fmt: skip
-        bundle_in = partial(
-            bundle_with, bundle, world_size=world_size, communication_range=communication_range
-        )
-        if vehicle is VehicleKind.SIMULATED:
-            _fly_on_clock(
-                fleet_scenario,
-                bundle_in,
-                as_json,
-                out,
-                recorded,
-                settings,
-                loss=loss,
-                delay_s=delay,
-            )
-            return
-
-        # What is wrong with the flight itself has been said before this is.
-        prepared = partial(_say_if_carried, count, bundle, flown)
-        if not script:
-            _serve(fleet_scenario, bundle_in, px4, out or DEFAULT_OUT, prepared, settings)
-            return
-        _launch(fleet_scenario, bundle_in, px4, as_json, out, prepared, settings)
-        return
     from lpac.radio.modelled import ModelledRadio
-    from lpac.sim.experiment import Scenario
+    from lpac.sim.scenario import Scenario
 
-    assert count is not None
-    found = calibration(wifi, transport=transport is not None)
+    is_point, team = vehicle is VehicleKind.POINT, 1 if count is None else count
+    found = calibration(wifi, transport=is_point and transport is not None)
     if transport and (loss or delay):
         raise ValueError(
             f"--{'loss' if loss else 'delay'} and --transport: the model itself says what is lost, "
@@ -352,7 +294,7 @@ def sim(
         )
     scenario = Scenario(
         controller=controller.value,
-        robots=count,
+        robots=team,
         seed=seed,
         duration_s=duration,
         features=world_features,
@@ -361,17 +303,36 @@ def sim(
         scale=model,
         loss=loss,
         delay_s=delay,
-        radio=ModelledRadio(transport.value, found.wifi) if transport else None,
+        radio=ModelledRadio(transport.value, found.wifi) if transport and is_point else None,
         max_message_age_s=max_message_age,
         max_input_age_s=max_input_age_s,
         payload=payload.value,
         world_size=world_size,
         communication_range=communication_range,
         lag_s=lag,
-        failures=_failures(lost, away or (), count, duration),
-        position_bias=_position_bias(seed, position_error, count, model),
+        failures=_failures(lost, away or (), team, duration),
+        position_bias=_position_bias(seed, position_error, team, model),
         clocks=clocks,
+        errors=errors,
+        sensor=sensor,
+        secure=secure,
+        transport=transport.value if transport and not is_point else "mesh",
     )
+    if vehicle is VehicleKind.SIMULATED:
+        _fly_on_clock(scenario, bundle, as_json, out, recorded)
+        return
+    if not is_point:
+        check_px4(vehicle, px4)
+        flown: Literal["mavlink", "px4"] = "px4" if vehicle is VehicleKind.PX4 else "mavlink"
+        scenario = _sized(scenario, count, bundle, flown)
+        # What is wrong with the flight itself has been said before this is.
+        prepared = partial(_say_if_carried, count, bundle, flown)
+        if not script:
+            _serve(scenario, bundle, px4, out or DEFAULT_OUT, prepared)
+            return
+        _launch(scenario, bundle, px4, as_json, out, prepared)
+        return
+    assert count is not None
     if out:
         out.mkdir(parents=True, exist_ok=True)
     _tell_of_features_outside(world, world_features, bundle, world_size)
@@ -502,8 +463,8 @@ def _robot_count(text: str | None, vehicle: VehicleKind) -> int | None:
 
 
 def _sized(
-    scenario: "FleetScenario", count: int | None, bundle: Path, vehicle: Literal["mavlink", "px4"]
-) -> "FleetScenario":
+    scenario: "Scenario", count: int | None, bundle: Path, vehicle: Literal["mavlink", "px4"]
+) -> "Scenario":
     """With as many robots as this machine carries, unless their number was given.
 
     What is wrong with a flight is said before the machine is measured.
@@ -549,13 +510,12 @@ def _carries(robots: int) -> str:
 
 
 def _launch(
-    scenario: "FleetScenario",
-    bundle_in: Callable[[Path], Path],
+    scenario: "Scenario",
+    bundle: Path,
     px4: Path | None,
     as_json: bool,
     out: Path | None,
     prepared: Callable[[], int | None],
-    settings: "Settings",
 ) -> None:
     """Run a fleet of processes; exit code 1 if its flight did not end as it should.
 
@@ -572,8 +532,7 @@ def _launch(
         FleetDisplay(scenario.robots) as display,
     ):
         folder = out or Path(nowhere)
-        bundle = bundle_in(folder / _OWN_BUNDLE)
-        fleet = Fleet(scenario, folder, bundle, px4_build=px4, say=display.say, settings=settings)
+        fleet = Fleet(scenario, folder, bundle, px4_build=px4, say=display.say)
         fleet.carried = prepared()
         flight = fly(
             fleet, display.say, lambda step: display.show_or_say(step, fleet.heard.statuses())
@@ -582,21 +541,15 @@ def _launch(
 
 
 def _fly_on_clock(
-    scenario: "FleetScenario",
-    bundle_in: Callable[[Path], Path],
+    scenario: "Scenario",
+    bundle: Path,
     as_json: bool,
     out: Path | None,
     recorded: Path | None,
-    settings: "Settings",
-    *,
-    loss: float,
-    delay_s: float,
 ) -> None:
     """Fly whole robots on one simulated clock; exit code 1 unless it ended as it should."""
     from lpac.sim.fleet.clocked import fly_simulated
-    from lpac.sim.radio import Air
 
-    air = Air(loss=loss, delay_s=max(delay_s, Air().delay_s)) if loss or delay_s else None
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere:
         folder = out or Path(nowhere)
         said = ["the fleet is made"]
@@ -607,9 +560,8 @@ def _fly_on_clock(
 
         with lines_of(lambda: f"{said[-1]}: still at it"):
             flight = fly_simulated(
-                scenario, folder, bundle_in(folder / _OWN_BUNDLE), say,
-                logs=out is not None, recorded=recorded, settings=settings, air=air,
-            )  # fmt: skip
+                scenario, folder, bundle, say, logs=out is not None, recorded=recorded
+            )
     _show_fleet_flight(flight, as_json, out)
 
 
@@ -639,12 +591,11 @@ def _show_fleet_flight(flight: "FleetFlight", as_json: bool, out: Path | None) -
 
 
 def _serve(
-    scenario: "FleetScenario",
-    bundle_in: Callable[[Path], Path],
+    scenario: "Scenario",
+    bundle: Path,
     px4: Path | None,
     out: Path,
     prepared: Callable[[], int | None],
-    settings: "Settings",
 ) -> None:
     """Run a fleet of processes for `lpac ground` until Ctrl-C, and only listen to it."""
     from edge.core.counted import counted
@@ -654,8 +605,7 @@ def _serve(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with FleetDisplay(scenario.robots) as display:
-            bundle = bundle_in(out / _OWN_BUNDLE)
-            fleet = Fleet(scenario, out, bundle, px4_build=px4, say=display.say, settings=settings)
+            fleet = Fleet(scenario, out, bundle, px4_build=px4, say=display.say)
             fleet.carried = prepared()
             with fleet:
                 while not fleet.heard.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):

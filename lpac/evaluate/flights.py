@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -21,25 +21,16 @@ from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName
 from lpac.sim.batch import PolicyFailedError, fly_batch
 from lpac.sim.cores import Pool
-from lpac.sim.experiment import (
-    FIELD_SCALE,
-    Scenario,
-    SimulatedFlight,
-    cost_times_s,
-    draw_position_errors_m,
-    fly,
-    prepare,
-)
+from lpac.sim.description import FIELD_SCALE
+from lpac.sim.experiment import SimulatedFlight, cost_times_s, draw_position_errors_m, fly, prepare
 from lpac.sim.failure import NONE_LOST, LostRobots
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.flight import fly as fly_fleet
-from lpac.sim.fleet.layout import FleetScenario, Layout
-from lpac.sim.fleet.own_bundle import bundle_with
+from lpac.sim.fleet.layout import Layout
 from lpac.sim.fleet.processes import Fleet
-from lpac.sim.fleet.robots import Settings
 from lpac.sim.kept import KeptOutcomes, code_digest
-from lpac.sim.radio import Air
+from lpac.sim.scenario import Scenario
 from lpac.sim.ticks import Clocks
 
 BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
@@ -197,8 +188,7 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
     starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts)).tolist()
     errors_m = draw_position_errors_m(world.seed, flight.position_error_m, set_up.robots)
     if flight.robot != "point":
-        with TemporaryDirectory() as folder:
-            layout = Layout(fleet_of(flight), bundle_for(flight, Path(folder)))
+        layout = Layout(fleet_of(flight), Path(flight.bundle))
         starts_m = layout.pads_m.tolist()
         # What a vehicle takes its pad to be is off by its receiver's bias.
         errors_m = errors_m + layout.landing_points_m - layout.pads_m
@@ -234,64 +224,41 @@ def _best_of_ten(flight: EvaluationFlight) -> FlownCost:
     return FlownCost((0.0, 0.0), cost)
 
 
-def fleet_of(flight: EvaluationFlight) -> FleetScenario:
+def fleet_of(flight: EvaluationFlight) -> Scenario:
     """Whole robots over the flight's world; where they stand follows from its seed."""
     set_up = SET_UPS[flight.set_up]
     world = draw_world(flight.world_set, flight.world, set_up)
-    return FleetScenario(
+    return Scenario(
         robots=set_up.robots,
         seed=world.seed,
         duration_s=flight.duration_s,
         features=world.features,
+        world_size=set_up.world_size,
+        communication_range=set_up.communication_range,
     )
 
 
-def bundle_for(flight: EvaluationFlight, folder: Path) -> Path:
-    """The bundle that whole robots fly in its set-up: of its world's size, and its range.
-
-    A new one, in the folder, where the flight's own has others. Raises BundleError.
-    """
-    set_up = SET_UPS[flight.set_up]
-    return bundle_with(
-        Path(flight.bundle), folder / "own",
-        world_size=set_up.world_size, communication_range=set_up.communication_range,
-    )  # fmt: skip
-
-
-def settings_of(flight: EvaluationFlight) -> Settings:
-    """What whole robots' configuration has of it."""
-    return {
-        "rates": {
-            "perception_hz": 1.0 / flight.clocks.perception_s,
-            "policy_hz": 1.0 / flight.clocks.policy_s,
-            "control_hz": 1.0 / flight.clocks.control_s,
-        },
-        "policy": {
-            "max_message_age_s": flight.max_message_age_s,
-            "max_input_age_s": flight.max_input_age_s,
-        },
-    }
+def whole_scenario(flight: EvaluationFlight) -> Scenario:
+    """The same with its radio, its ages and its clocks."""
+    return replace(
+        fleet_of(flight),
+        loss=flight.loss,
+        delay_s=flight.delay_s,
+        max_message_age_s=flight.max_message_age_s,
+        max_input_age_s=flight.max_input_age_s,
+        clocks=flight.clocks,
+    )
 
 
 def _whole(flight: EvaluationFlight) -> FlownCost:
     _bundle(flight)
-    if flight.clocks.synchronous:
-        raise ValueError(f"{flight.key}: whole robots have moments of their own")
-    is_hindered = bool(flight.loss or flight.delay_s)
-    if is_hindered and flight.robot in IN_REAL_TIME:
-        raise ValueError(f"{flight.key}: the radio of programs in real time is what it is")
-    with TemporaryDirectory() as own:
-        folder, bundle = Path(own, "fleet"), bundle_for(flight, Path(own))
-        scenario, settings = fleet_of(flight), settings_of(flight)
-        if flight.robot in IN_REAL_TIME:
-            px4_build = Path(flight.px4_build) if flight.px4_build else None
-            fleet = Fleet(scenario, folder, bundle, px4_build=px4_build, settings=settings)
-            return whole_cost(flight, fly_fleet(fleet))
-        air = None
-        if is_hindered:
-            air = Air(loss=flight.loss, delay_s=max(flight.delay_s, Air().delay_s))
-        flown = fly_simulated(scenario, folder, bundle, settings=settings, air=air)
-    return whole_cost(flight, flown)
+    scenario, bundle = whole_scenario(flight), Path(flight.bundle)
+    with TemporaryDirectory() as folder:
+        if flight.robot == "simulated":
+            return whole_cost(flight, fly_simulated(scenario, folder, bundle))
+        px4_build = Path(flight.px4_build) if flight.px4_build else None
+        fleet = Fleet(scenario, Path(folder), bundle, px4_build=px4_build)
+        return whole_cost(flight, fly_fleet(fleet))
 
 
 def whole_cost(flight: EvaluationFlight, flown: FleetFlight) -> FlownCost:

@@ -22,10 +22,11 @@ from lpac.analysis.flight import COST_PERIOD_S, FlightRecord
 from lpac.evaluate.flights import BASELINES
 from lpac.evaluate.worlds import FIELD as FIELD_SET_UP
 from lpac.evaluate.worlds import DrawnWorld, draw_world
-from lpac.sim.experiment import FIELD_SCALE, SAMPLE_S, Controller, Scenario, SimulatedFlight
+from lpac.sim.description import FIELD_SCALE
+from lpac.sim.experiment import SAMPLE_S, SimulatedFlight
 from lpac.sim.failure import Failure
-from lpac.sim.fleet.layout import FleetScenario, Layout, pads_for_all
-from lpac.sim.fleet.pilot import PilotFlight
+from lpac.sim.fleet.layout import Layout, pads_for_all
+from lpac.sim.scenario import Controller, Scenario
 
 # E1: who flies, and when the field is looked at, s.
 _CONTROLLERS: tuple[Controller, ...] = ("lpac", *BASELINES)
@@ -80,18 +81,18 @@ def transferability(worlds: int = 3, starts_m: F64 | None = None) -> dict[str, d
     }
 
 
-def whole_transferability(bundle: Path, worlds: int = 3) -> dict[str, FleetScenario]:
+def whole_transferability(bundle: Path, worlds: int = 3) -> dict[str, Scenario]:
     """E1 for whole robots, which stand on pads with room between them. Raises BundleError.
 
     Their receivers, and the wind, are the same in all worlds.
     """
     pads_m = _pairs(pads_of(bundle))
     return {
-        f"world {number}": FleetScenario(
+        f"world {number}": Scenario(
             robots=FIELD_SET_UP.robots,
             seed=_world(0).seed,
             features=world.features,
-            pads_m=pads_m,
+            starts_m=pads_m,
             duration_s=SNAPSHOTS_S[-1],
         )
         for number, world in ((number, _world(number)) for number in range(worlds))
@@ -124,18 +125,18 @@ def beside(record: FlightRecord) -> dict[str, Scenario]:
 
 def pads_of(bundle: Path) -> F64:
     """(N, 2): where whole robots stand, m. Raises BundleError."""
-    scenario = FleetScenario(robots=FIELD_SET_UP.robots, seed=_world(0).seed)
+    scenario = Scenario(robots=FIELD_SET_UP.robots, seed=_world(0).seed)
     return Layout(scenario, bundle).pads_m
 
 
-def whole_repeatability(bundle: Path, trials: int = 3, world: int = 0) -> dict[str, FleetScenario]:
+def whole_repeatability(bundle: Path, trials: int = 3, world: int = 0) -> dict[str, Scenario]:
     """E2 for whole robots, whose receivers, compasses and winds differ by trial.
 
     Raises BundleError; ValueError if no pads are apart for the receivers of so many trials.
     """
     drawn = _world(world)
     scenarios = [
-        FleetScenario(
+        Scenario(
             robots=FIELD_SET_UP.robots,
             seed=drawn.seed + trial,
             features=drawn.features,
@@ -148,7 +149,7 @@ def whole_repeatability(bundle: Path, trials: int = 3, world: int = 0) -> dict[s
     for trial, scenario in enumerate(scenarios):
         rng = np.random.default_rng(np.random.SeedSequence([drawn.seed, trial]))
         placed_m = pads_m + _around(rng.uniform(0.0, 1.0, len(pads_m)) ** 0.5, rng)
-        placed[f"trial {trial + 1}"] = replace(scenario, pads_m=_pairs(placed_m))
+        placed[f"trial {trial + 1}"] = replace(scenario, starts_m=_pairs(placed_m))
     return placed
 
 
@@ -196,22 +197,12 @@ def perturbation(world: int = 0) -> Scenario:
     )
 
 
-def whole_perturbation(
-    bundle: Path, world: int = 0
-) -> tuple[FleetScenario, tuple[PilotFlight, ...]]:
-    """E3 for whole robots: pilots fly them out of the fence, and back. Raises BundleError.
+def whole_perturbation(bundle: Path, world: int = 0) -> Scenario:
+    """E3 for whole robots, which pilots fly out of the fence, and back. Raises BundleError.
 
     Their receivers, and the wind, are the same in all worlds.
     """
-    scenario = FleetScenario(
-        robots=FIELD_SET_UP.robots,
-        seed=_world(0).seed,
-        features=_world(world).features,
-        pads_m=_pairs(pads_of(bundle)),
-        duration_s=_E3_DURATION_S,
-    )
-    taken = zip(TAKEN, _taken_at_s(), strict=True)
-    return scenario, tuple(PilotFlight(robot, at_s, at_s + AWAY_S) for robot, at_s in taken)
+    return replace(perturbation(world), seed=_world(0).seed, starts_m=_pairs(pads_of(bundle)))
 
 
 def _taken_at_s() -> list[float]:

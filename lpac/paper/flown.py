@@ -10,13 +10,12 @@ from typing import NamedTuple
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.analysis.flight import FlightRecord
 from lpac.sim.cores import Pool
-from lpac.sim.experiment import Scenario, SimulatedFlight, fly
+from lpac.sim.experiment import SimulatedFlight, fly
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.flight import fly as fly_fleet
-from lpac.sim.fleet.layout import FleetScenario
-from lpac.sim.fleet.pilot import FOR_A_PILOT, PilotFlight
 from lpac.sim.fleet.processes import Fleet
+from lpac.sim.scenario import Scenario
 
 
 class _Task(NamedTuple):
@@ -46,7 +45,7 @@ def _fly(task: _Task) -> _Flown:
 class _WholeTask(NamedTuple):
     number: int
     bundle: str
-    scenario: FleetScenario
+    scenario: Scenario
 
 
 class _WholeFlown(NamedTuple):
@@ -55,7 +54,7 @@ class _WholeFlown(NamedTuple):
 
 
 def fly_whole(
-    scenarios: Sequence[FleetScenario], bundle: Path, pool: Pool
+    scenarios: Sequence[Scenario], bundle: Path, pool: Pool
 ) -> Generator[tuple[int, FlightRecord], None, None]:
     """Each flight of whole robots on a simulated clock as it is done, with its number.
 
@@ -72,32 +71,18 @@ def _fly_whole(task: _WholeTask) -> _WholeFlown:
     return _WholeFlown(task.number, _record(flown))
 
 
-def fly_piloted(
-    scenario: FleetScenario, bundle: Path, pilots: Sequence[PilotFlight]
-) -> FlightRecord:
-    """A flight of whole robots on a simulated clock, some of which pilots take meanwhile.
-
-    Raises BundleError; ValueError if it came to no mission.
-    """
-    with TemporaryDirectory() as folder:
-        return _record(fly_simulated(scenario, Path(folder), bundle, pilots=pilots))
-
-
 def fly_programs(
-    scenario: FleetScenario,
+    scenario: Scenario,
     folder: Path,
     bundle: Path,
     px4_build: Path | None = None,
-    pilots: Sequence[PilotFlight] = (),
 ) -> FlightRecord:
     """A flight of a program for each robot, in real time; its logs stay in `folder`.
 
-    Their vehicles, which `pilots` may take, are PX4s of that build, or simulated. Raises what
-    `lpac sim` does, and ValueError if it came to no mission.
+    Their vehicles are PX4s of that build, or simulated. Raises what `lpac sim` does, and ValueError
+    if it came to no mission.
     """
-    settings = FOR_A_PILOT if pilots else None
-    fleet = Fleet(scenario, folder, bundle, px4_build=px4_build, settings=settings)
-    return _record(fly_fleet(fleet, pilots=pilots))
+    return _record(fly_fleet(Fleet(scenario, folder, bundle, px4_build=px4_build)))
 
 
 def _record(flown: FleetFlight) -> FlightRecord:

@@ -5,10 +5,12 @@ from dataclasses import asdict
 from typing import Any
 
 from edge.core.fence import Fence
+from edge.core.frames import ModelScale
 from edge.flight.margins import ErrorBudget
 from edge.flight.reach import Reach
-from lpac.sim.experiment import FIELD_SCALE
 
+# The paper's field tests: 32 m x 32 m for a world of 512 x 512 model units.
+FIELD_SCALE = ModelScale(env_scale=16.0, velocity_scale=0.25)
 ERRORS = ErrorBudget()
 REACH = Reach()
 _BASE_HEIGHT_M = 5.0

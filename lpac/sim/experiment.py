@@ -2,118 +2,29 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal, Protocol
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 
 from edge.core import F32, F64, Bools
-from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
-from edge.core.wire import MAX_ROBOT_ID, PayloadType
-from edge.core.world import Feature, random_features, rasterize
+from edge.core.world import Feature, rasterize
 from edge.drivers.registry import load_policy
-from edge.policy.bundle import Bundle, BundleError
+from edge.policy.bundle import Bundle
 from edge.robot.pac import PacParameters
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, RobotRecord
 from lpac.analysis.logs import LoopRates
-from lpac.radio.airtime import LinkQuality
-from lpac.radio.modelled import ModelledRadio
-from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
-from lpac.sim.failure import Failure, alive_at, require_possible
+from lpac.sim.baselines import BaselineSwarm, make_baseline
+from lpac.sim.failure import alive_at
 from lpac.sim.medium import Medium
+from lpac.sim.scenario import Scenario
 from lpac.sim.swarm import ClockedPac, Swarm, pac_swarm
-from lpac.sim.ticks import Clocks
 from lpac.sim.vehicles import PointVehicles
 
-Controller = Literal["lpac"] | BaselineName
-
-# The paper's field tests: 32 m x 32 m for a world of 512 x 512 model units.
-FIELD_SCALE = ModelScale(env_scale=16.0, velocity_scale=0.25)
-
-MAX_ROBOTS = MAX_ROBOT_ID + 1
 SAMPLE_S = 0.2
 SAMPLES_PER_COST = 5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scenario:
-    """A flight to simulate; everything random in it follows from `seed`.
-
-    Without `features` the world has `random_feature_count` Gaussian ones, `random_feature_sigma`
-    (least, greatest) wide, in model units; without `starts_m`, one position in the mission frame
-    per robot, they start anywhere in the world. `world_size` and `communication_range`, in model
-    units, and `max_speed_m_s` are the bundle's where they are None. `position_bias` is, per robot
-    and in model units, by how much its knowledge of its position is wrong; `lag_s` the time
-    constant with which velocities follow what is told; ages and `payload` are those of
-    `PacParameters`. With a `radio` its model says what is lost and late in a team of `robots`, and
-    `loss` and `delay_s` are 0. Baselines know true positions, do not fail, and need no radio.
-
-    Raises ValueError that names what is impossible.
-    """
-
-    controller: Controller = "lpac"
-    robots: int = 10
-    seed: int = 0
-    duration_s: float = 60.0
-    features: tuple[Feature, ...] | None = None
-    random_feature_count: int = 10
-    starts_m: tuple[tuple[float, float], ...] | None = None
-    scale: ModelScale = FIELD_SCALE
-    loss: float = 0.0
-    delay_s: float = 0.0
-    radio: ModelledRadio | None = None
-    max_message_age_s: float = 0.8
-    max_input_age_s: float = 1.0
-    payload: PayloadType = "float16"
-    random_feature_sigma: tuple[float, float] = (40.0, 60.0)
-    world_size: int | None = None
-    communication_range: float | None = None
-    max_speed_m_s: float | None = None
-    lag_s: float = 0.0
-    position_bias: tuple[tuple[float, float], ...] | None = None
-    failures: tuple[Failure, ...] = ()
-    clocks: Clocks = field(default_factory=Clocks)
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.robots <= MAX_ROBOTS:
-            raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
-        if self.seed < 0:
-            raise ValueError(f"seed = {self.seed}: must be at least 0")
-        for name, of_each in (("starts_m", self.starts_m), ("position_bias", self.position_bias)):
-            if of_each is not None and len(of_each) != self.robots:
-                raise ValueError(f"{name}: {len(of_each)} positions for {self.robots} robots")
-        if not 0.0 < self.duration_s < np.inf:
-            raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
-        if self.random_feature_count < 0:
-            raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
-        if self.radio is not None and (self.loss or self.delay_s):
-            raise ValueError(
-                f"loss = {self.loss}, delay_s = {self.delay_s}: must be 0 with a modelled radio"
-            )
-        if not 0.0 <= self.max_message_age_s < np.inf:
-            raise ValueError(
-                f"max_message_age_s = {self.max_message_age_s}: must be at least 0 and finite"
-            )
-        least, greatest = self.random_feature_sigma
-        if not 0.0 < least <= greatest < np.inf:
-            raise ValueError(
-                f"random_feature_sigma = {self.random_feature_sigma}: must be (least, greatest) "
-                "above 0"
-            )
-        if self.controller != "lpac" and self.failures:
-            raise ValueError(f"controller = {self.controller!r}: a baseline knows no failures")
-        if self.controller != "lpac" and self.radio is not None:
-            raise ValueError(f"controller = {self.controller!r}: a baseline needs no radio")
-        require_possible(self.failures, self.robots)
-
-    @property
-    def link(self) -> LinkQuality:
-        """What messages suffer, as it was asked for, or by the model."""
-        if self.radio is None:
-            return LinkQuality(self.loss, self.delay_s)
-        return self.radio.link(self.robots, self.payload, 1.0 / self.clocks.policy_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -243,25 +154,14 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
     Raises BundleError for a bundle without perception, ValueError for impossible sizes and link
     parameters.
     """
-    manifest, scale = bundle.manifest, scenario.scale
-    perception, training = manifest.perception, manifest.training
-    if perception is None:
-        raise BundleError(f"bundle {manifest.name!r} has no perception: it cannot fly")
-    if scenario.world_size is not None:
-        perception = replace(perception, world_size=scenario.world_size)
-    if scenario.communication_range is not None:
-        perception = replace(perception, communication_range=scenario.communication_range)
-    bundle = replace(bundle, manifest=replace(manifest, perception=perception))
-    seeds = np.random.SeedSequence(scenario.seed).spawn(4)
-    world_rng, start_rng, clock_rng, medium_rng = (np.random.default_rng(seed) for seed in seeds)
-    features = scenario.features
-    if features is None:
-        features = random_features(
-            world_rng,
-            scenario.random_feature_count,
-            perception.world_size,
-            scenario.random_feature_sigma,
-        )
+    scenario.require_default("points", "errors", "budget", "sensor", "secure", "transport")
+    scale, training = scenario.scale, bundle.manifest.training
+    perception = scenario.perception_of(bundle)
+    bundle = replace(bundle, manifest=replace(bundle.manifest, perception=perception))
+    # The first of the four is the world's.
+    seeds = np.random.SeedSequence(scenario.seed).spawn(4)[1:]
+    start_rng, clock_rng, medium_rng = (np.random.default_rng(seed) for seed in seeds)
+    features = scenario.draw_features(perception.world_size)
     max_speed_m_s = scenario.max_speed_m_s
     if max_speed_m_s is None:
         max_speed_m_s = training.max_speed * scale.velocity_scale

@@ -14,12 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core.counted import counted
-from lpac.sim.experiment import Scenario
-from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.scenario import Scenario
 
 USUAL_JSON = Path(__file__).with_suffix(".json")
 # What was flown: points as `lpac demo` has them, and whole robots with errors of their receivers.
-POINTS, WHOLE = Scenario(), FleetScenario(duration_s=50.0)
+POINTS, WHOLE = Scenario(), Scenario(duration_s=50.0)
 _SHARES = (0.1, 0.9)
 
 
@@ -44,7 +43,7 @@ def usual_points(scenario: Scenario, bundle_id: str) -> Usual | None:
     return _nearest("points", scenario.robots, bundle_id)
 
 
-def usual_whole(scenario: FleetScenario, bundle_id: str) -> Usual | None:
+def usual_whole(scenario: Scenario, bundle_id: str) -> Usual | None:
     """Of the nearest number of robots that was flown; None if nothing like it was."""
     alike = replace(
         WHOLE, seed=scenario.seed, robots=scenario.robots, duration_s=scenario.duration_s,

@@ -16,7 +16,8 @@ from edge.core.world import MOST_FEATURES
 from edge.policy.bundle import Training
 from export.parameters import PolicyParameters
 from lpac.evaluate.worlds import SET_UPS
-from lpac.sim.experiment import FIELD_SCALE, MAX_ROBOTS
+from lpac.sim.description import FIELD_SCALE
+from lpac.sim.scenario import MAX_ROBOTS
 from lpac.sim.ticks import Clocks
 from lpac.train.family import Learnable, StateDict, learnable
 

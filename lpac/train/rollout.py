@@ -19,8 +19,8 @@ from edge.policy.family import Observation
 from lpac.evaluate.worlds import SetUp, draw_world
 from lpac.sim.batch import BatchedFlights, BatchMoment, PolicyFailedError
 from lpac.sim.batch.agents import Agents, Inputs, PolicySteps, make_agents
-from lpac.sim.experiment import Scenario
 from lpac.sim.failure import Failure
+from lpac.sim.scenario import Scenario
 from lpac.train.config import DaggerConfig, DataConfig, Disturbances
 from lpac.train.expert import LOOK_PERIOD_S
 from lpac.train.task import CoverageTask, Task, Teacher

@@ -23,7 +23,8 @@ import json
 from pathlib import Path
 from edge.policy.bundle import load_bundle
 from lpac.sim.batch import fly_batch
-from lpac.sim.experiment import Scenario, fly
+from lpac.sim.experiment import fly
+from lpac.sim.scenario import Scenario
 from lpac.sim.failure import Failure
 
 bundle = load_bundle(Path("lloyd"))

@@ -14,7 +14,8 @@ import torch
 from edge.core.schema import ConfigError
 from edge.policy.bundle import load_bundle
 from edge.policy.family import Observation
-from lpac.sim.experiment import Scenario, fly
+from lpac.sim.experiment import fly
+from lpac.sim.scenario import Scenario
 from lpac.train.config import config_of
 from lpac.train.run import TrainingRun
 from tests.conftest import ROOT

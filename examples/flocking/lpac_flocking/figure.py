@@ -12,7 +12,8 @@ import numpy as np
 from edge.core import F64
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.analysis import style
-from lpac.sim.experiment import Scenario, fly, prepare
+from lpac.sim.experiment import fly, prepare
+from lpac.sim.scenario import Scenario
 from lpac_flocking.task import FlockExpert, disagreement_m_s, speed_m_s
 
 _STEP_S = 0.2

@@ -20,7 +20,8 @@ from edge.robot.pac import PacParameters
 from lpac.sim.batch.agents import Agents, make_agents
 from lpac.sim.batch.robot import BatchedRobot, DeferredSteps
 from lpac.sim.batch.seen import ShownWorld
-from lpac.sim.experiment import Preparation, Scenario, SimulatedFlight, WorldMoment, prepare
+from lpac.sim.experiment import Preparation, SimulatedFlight, WorldMoment, prepare
+from lpac.sim.scenario import Scenario
 from lpac.sim.swarm import Swarm
 from lpac.sim.vehicles import PointVehicles
 

@@ -25,7 +25,8 @@ from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.flight import Timeline
 from lpac.sim.drill.injections import Do, FenceWithout, Injection, OperatorOrders, OrderedKind
 from lpac.sim.drill.truth import FlightTruth, GivenOrder, VehicleTruth
-from lpac.sim.fleet.layout import WORLD_SENSOR, FleetScenario, Layout
+from lpac.sim.fleet.layout import Layout
+from lpac.sim.scenario import WORLD_SENSOR, Scenario
 
 # Receivers with corrections, whose estimates still wander by 0.15 m along each axis, and heights
 # that hardly walk.
@@ -181,9 +182,9 @@ class DrilledRobots:
     sensor: str = WORLD_SENSOR
 
 
-def scenario_of(fault: Fault, seed: int, drilled: DrilledRobots) -> FleetScenario:
+def scenario_of(fault: Fault, seed: int, drilled: DrilledRobots) -> Scenario:
     """The fleet that flies it: members with keys, on vehicles that err, unless they are exact."""
-    return FleetScenario(
+    return Scenario(
         robots=drilled.robots, seed=seed, secure=True, errors=not fault.exact,
         budget=EXACT if fault.exact else ERRORS, sensor=drilled.sensor,
     )  # fmt: skip

@@ -48,11 +48,12 @@ from lpac.sim.drill.injections import (
     WatchdogDies,
 )
 from lpac.sim.drill.truth import FlightTruth, VehicleTruth, vehicle_truth
-from lpac.sim.fleet.layout import WORLD, WORLD_SENSOR
+from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.radio import GROUND
+from lpac.sim.scenario import WORLD_SENSOR
 
 # How far a second program's vehicle stands from the first.
 _BESIDE_M = 3.0

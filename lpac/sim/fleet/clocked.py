@@ -1,7 +1,6 @@
 """One flight of a fleet on the simulated clock, by a script of the real ground."""
 
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,80 +12,64 @@ from lpac.analysis.logs import logs_of
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
+from lpac.sim.failure import Failure
 from lpac.sim.fleet.flight import FleetFlight, RobotUsage, flight_of
-from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.listener import Say
-from lpac.sim.fleet.pilot import FOR_A_PILOT, LOOKS_S, Pilot, PilotFlight
-from lpac.sim.fleet.robots import Settings
+from lpac.sim.fleet.pilot import LOOKS_S, Pilot, perturbations
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.radio import Air
+from lpac.sim.scenario import Scenario
 
 # No flight lasts so long, and as many of them end before the year 2038.
 _APART_S, _BEGINNINGS = 1000.0, 340_000
 
 
 def fly_simulated(
-    scenario: FleetScenario,
+    scenario: Scenario,
     folder: Path | str,
     bundle: Path | str,
     say: Say = lambda _: None,
     *,
     logs: bool = False,
     recorded: Path | None = None,
-    pilots: Sequence[PilotFlight] = (),
-    settings: Settings | None = None,
-    air: Air | None = None,
 ) -> FleetFlight:
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
     Robots fly the bundle at the path `bundle`, which stays where it is; `say` is told each step of
     the script, and when it begins on the simulated clock. With `logs` the robots write theirs below
     `folder`, in robots/ID/logs; `recorded` is the folder of such a flight, whose policies' steps
-    are taken again. `pilots` take robots out of the field, and bring them back. `settings` are
-    further keys of robot.toml's tables, for all robots, and `air` is what becomes of messages from
-    the mission's start on. Times, positions and costs are in the record; `problem` says what kept
-    the script from its end. Of what robots log meanwhile only errors are shown.
+    are taken again. Times, positions and costs are in the record; `problem` says what kept the
+    script from its end. Of what robots log meanwhile only errors are shown.
 
-    Raises BundleError, ValueError for pads that find no room, OSError for a folder that cannot be
-    written, RecordingError, and PartError if a policy or a sensor raises anything.
+    Raises BundleError, ValueError for pads that find no room and for what whole robots cannot do,
+    OSError for a folder that cannot be written, RecordingError, and PartError if a policy or a
+    sensor raises anything.
     """
-
+    scenario.require_default("robots on a simulated clock", "transport")
     # What ten robots say to their own logs is nothing for a person.
     with errors_only():
-        return _fly(
-            scenario, Path(folder), Path(bundle), say, logs, recorded, pilots, settings, air
-        )
+        return _fly(scenario, Path(folder), Path(bundle), say, logs, recorded)
 
 
 def _fly(
-    scenario: FleetScenario,
-    folder: Path,
-    bundle: Path,
-    say: Say,
-    logs: bool,
-    recorded: Path | None,
-    pilots: Sequence[PilotFlight],
-    settings: Settings | None,
-    air: Air | None,
+    scenario: Scenario, folder: Path, bundle: Path, say: Say, logs: bool, recorded: Path | None
 ) -> FleetFlight:
     earlier = set(folder.rglob("*.mcap"))
     # Logs of several flights, read together, must be of different times, and those of the same
     # flight, flown again, of the same.
-    flight_is = (scenario, load_bundle(bundle).id, settings, air, tuple(pilots))
-    beginning = zlib.crc32(repr(flight_is).encode()) % _BEGINNINGS
+    beginning = zlib.crc32(repr((scenario, load_bundle(bundle).id)).encode()) % _BEGINNINGS
     fleet = SimulatedFleet(
         scenario,
         folder,
         bundle,
-        settings={**(settings or {}), **(FOR_A_PILOT if pilots else {})},
         logs=logs,
         recorded=recorded,
         epoch_s=EPOCH_S + _APART_S * beginning,
     )
     ground = fleet.ground
     for each in fleet.vehicles:
-        each.vehicle.rc_connected = bool(pilots)
+        each.vehicle.rc_connected = bool(scenario.failures)
 
     def say_when(text: str) -> None:
         say(f"{ground.now_s:6.1f} s  {text}")
@@ -94,18 +77,20 @@ def _fly(
     def begin(step: str) -> None:
         say_when(step)
         if step == "mission":
-            fleet.radio.air = air or fleet.radio.air
-            for flown in pilots:
-                fly_by_hand(flown)
+            if scenario.loss or scenario.delay_s:
+                delay_s = max(scenario.delay_s, Air().delay_s)
+                fleet.radio.air = Air(loss=scenario.loss, delay_s=delay_s)
+            for failure in scenario.failures:
+                fly_by_hand(failure)
 
-    def fly_by_hand(flown: PilotFlight) -> None:
-        robot, vehicle = fleet.robots[flown.robot], fleet.vehicles[flown.robot].vehicle
-        pilot = Pilot(vehicle, fleet.layout, flown, ground.now_s)
+    def fly_by_hand(failure: Failure) -> None:
+        robot, vehicle = fleet.robots[failure.robot], fleet.vehicles[failure.robot].vehicle
+        pilot = Pilot(vehicle, fleet.layout, failure, ground.now_s)
         fleet.schedule.every(LOOKS_S, lambda: pilot.look(ground.now_s, robot.status))
 
     flight = ScriptedFlight(
         ground, folder / "fleet.toml", scenario.duration_s,
-        perturb=tuple(each for flown in pilots for each in flown.perturbations),
+        perturb=perturbations(scenario.failures),
         on_step=begin, say=say_when,
     )  # fmt: skip
     notes = _Notes(fleet)

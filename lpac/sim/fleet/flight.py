@@ -22,14 +22,15 @@ from lpac.analysis.trials import find_missions, record_of, whole_record
 from lpac.analysis.truth import TRUTH, TrueTrack, write_truth
 from lpac.ground.station.client import GroundError
 from lpac.ground.station.commands import in_words
-from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.description import FIELD_SCALE
 from lpac.sim.fleet.ground import GroundProgram
-from lpac.sim.fleet.layout import WORLD, FleetScenario, Layout
+from lpac.sim.fleet.layout import WORLD, Layout
 from lpac.sim.fleet.listener import Say
-from lpac.sim.fleet.pilot import Pilot, PilotFlight
+from lpac.sim.fleet.pilot import Pilot, perturbations
 from lpac.sim.fleet.processes import Backlog, Fleet, OverloadError, Usage, process_usage
 from lpac.sim.fleet.scripted import CommandOutcome, ScriptedFlight
 from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError
+from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import Px4Build
 from lpac.sim.sitl.ground_station import RealVehicles
 from lpac.sim.usual import judgement, usual_whole
@@ -78,7 +79,7 @@ class FleetFlight:
     of the ground and of the simulated vehicles took: share of a core, and MB.
     """
 
-    scenario: FleetScenario
+    scenario: Scenario
     vehicle: str
     bundle_id: str
     record: FlightRecord
@@ -182,25 +183,21 @@ def fly(
     fleet: Fleet,
     say: Say = lambda _: None,
     watch: Callable[[str], None] = lambda _: None,
-    *,
-    pilots: Sequence[PilotFlight] = (),
 ) -> FleetFlight:
     """Run a fleet and its ground, and fly the script; `watch` gets the step's name now and then.
-
-    `pilots` take robots, which are set up `FOR_A_PILOT`, out of the field, and bring them back.
 
     Ctrl-C lands all, and so do a vehicle that ends, and a machine that does not keep up. Raises
     FleetError if a robot's program ends before all are heard; OSError, LinkError, GroundError or
     VehicleError if something cannot start.
     """
-    moments: dict[str, _Moment] = {}
+    scenario, moments = fleet.layout.scenario, dict[str, _Moment]()
     flying_by_hand: list[Pilot] = []
     step = "assemble"
     problem, overloaded = None, False
     with (
         fleet,
         GroundProgram(fleet.fleet_toml, fleet.name) as ground,
-        _in_sight(fleet) if pilots else nullcontext() as seen,
+        _in_sight(fleet) if scenario.failures else nullcontext() as seen,
     ):
         if seen is not None:
             with seen.stepped:
@@ -217,8 +214,8 @@ def fly(
             if name == "mission" and seen is not None:
                 now_s = ground.told.now_s
                 flying_by_hand[:] = [
-                    Pilot(seen.vehicles[flown.robot], fleet.layout, flown, now_s)
-                    for flown in pilots
+                    Pilot(seen.vehicles[failure.robot], fleet.layout, failure, now_s)
+                    for failure in scenario.failures
                 ]
 
         def look() -> None:
@@ -236,8 +233,8 @@ def fly(
             watch(step)
 
         flight = ScriptedFlight(
-            ground.told, fleet.fleet_toml, fleet.layout.scenario.duration_s,
-            perturb=tuple(each for flown in pilots for each in flown.perturbations),
+            ground.told, fleet.fleet_toml, scenario.duration_s,
+            perturb=perturbations(scenario.failures),
             on_step=begin, say=fleet.say_unless_behind,
         )  # fmt: skip
         try:

@@ -2,33 +2,34 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from edge.core import F64
 from edge.core.frames import LocalTransform
-from edge.core.world import Feature, format_world, random_features
-from edge.flight.margins import ErrorBudget, places_apart
+from edge.core.world import format_world
+from edge.flight.margins import places_apart
 from edge.messages.mission import Origin
-from edge.policy.bundle import BundleError, load_bundle
-from lpac.fleet.settings import Places, Transport
+from edge.policy.bundle import load_bundle, make_bundle, write_bundle
+from lpac.fleet.settings import Places
 from lpac.fleet.writer import assign, write_fleet, write_robot
-from lpac.sim.description import ERRORS, fence_around, robot_table
-from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.description import ERRORS, FIELD_SCALE, fence_around, robot_table
 from lpac.sim.px4.errors import Errors
 from lpac.sim.px4.vehicle import GPS_ACCURACY_M, Px4Vehicle
 from lpac.sim.px4.world import WorldOrigin
+from lpac.sim.scenario import Scenario
 
 MAX_ROBOTS = 30
+
+# Further keys of robot.toml, by table.
+Settings = Mapping[str, Mapping[str, object]]
 
 # The field is the policy's world; its y axis does not point north, so that mistakes show.
 WORLD = WorldOrigin()
 ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
 
-# The sensor's type that every installation has.
-WORLD_SENSOR = "world"
 # Pads, which are landing points too, of robots without a budget of their own.
 APART_M = places_apart(ERRORS.position_m, ERRORS.position_m).least_m
 # As far inside the field as there is room: what a robot takes its place to be walks.
@@ -40,43 +41,37 @@ _PAD_PUSHES = 300
 _PAD_SLACK = 1e-3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetScenario:
-    """A flight of a fleet; everything random in it but the timing follows from `seed`.
+def settings_of(scenario: Scenario) -> Settings:
+    """What robot.toml has of a scenario, by table."""
+    clocks = scenario.clocks
+    return {
+        "rates": {
+            "perception_hz": 1.0 / clocks.perception_s,
+            "policy_hz": 1.0 / clocks.policy_s,
+            "control_hz": 1.0 / clocks.control_s,
+        },
+        "policy": {
+            "max_message_age_s": scenario.max_message_age_s,
+            "max_input_age_s": scenario.max_input_age_s,
+        },
+        # PX4 obeys no other remote control.
+        "failsafe": {"rc": "pilot"} if scenario.failures else {},
+    }
 
-    The world is that of a `lpac.sim.experiment.Scenario` with the same seed. Without `errors` the
-    simulated vehicles' estimates are off by noise alone, and the air stands still. `budget` is what
-    the robots take their errors for: how far apart they stand and fly. `sensor` is the `type` in
-    robot.toml's [sensor]. With `secure` robots and ground are members of a fleet, with keys that
-    are made for it. `transport` is that of fleet.toml's [radio]. They stand at `pads_m`, (x, y) of
-    the mission frame, or else where there is room.
 
-    Raises ValueError that names what is impossible.
-    """
-
-    robots: int = 10
-    seed: int = 0
-    duration_s: float = 60.0
-    features: tuple[Feature, ...] | None = None
-    random_feature_count: int = 10
-    errors: bool = True
-    budget: ErrorBudget = ERRORS
-    sensor: str = WORLD_SENSOR
-    secure: bool = False
-    transport: Transport = "mesh"
-    pads_m: tuple[tuple[float, float], ...] | None = None
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.robots <= MAX_ROBOTS:
-            raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
-        if self.seed < 0:
-            raise ValueError(f"seed = {self.seed}: must be at least 0")
-        if not 0.0 < self.duration_s < math.inf:
-            raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
-        if self.pads_m is not None and len(self.pads_m) != self.robots:
-            raise ValueError(f"pads_m has {len(self.pads_m)} places: must be one for each robot")
-        if self.random_feature_count < 0:
-            raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
+def _require_flyable(scenario: Scenario) -> None:
+    """Raise ValueError for what whole robots cannot do."""
+    scenario.require_default(
+        "whole robots", "controller", "scale", "max_speed_m_s", "position_bias", "lag_s", "payload",
+        "radio",
+    )  # fmt: skip
+    if scenario.robots > MAX_ROBOTS:
+        raise ValueError(f"robots = {scenario.robots}: must be from 1 to {MAX_ROBOTS}")
+    if scenario.clocks.synchronous:
+        raise ValueError("synchronous = True: must be False for whole robots")
+    for failure in scenario.failures:
+        if not math.isfinite(failure.until_s):
+            raise ValueError(f"robot {failure.robot} is lost: whole robots can only be away")
 
 
 class Layout:
@@ -88,16 +83,19 @@ class Layout:
     """
 
     def __init__(
-        self, scenario: FleetScenario, bundle_path: Path, *, without_vehicles: bool = False
+        self, scenario: Scenario, bundle_path: Path, *, without_vehicles: bool = False
     ) -> None:
         """Raises ValueError if there is no room for so many robots; BundleError for a bundle that
         cannot be loaded, or has no perception."""
-        self.bundle = load_bundle(bundle_path)
-        perception, training = self.bundle.manifest.perception, self.bundle.manifest.training
-        if perception is None:
-            raise BundleError(f"{bundle_path}: the bundle has no perception: it cannot fly")
+        _require_flyable(scenario)
+        self.bundle, self.bundle_path = load_bundle(bundle_path), bundle_path.resolve()
+        manifest, perception = self.bundle.manifest, scenario.perception_of(self.bundle)
+        self._has_own_sizes = perception != manifest.perception
+        if self._has_own_sizes:
+            files = {name: self.bundle.files[name] for name in manifest.files}
+            self.bundle = make_bundle(replace(manifest, perception=perception), files)
+        training = manifest.training
         self.scenario = scenario
-        self.bundle_path = bundle_path.resolve()
         self.field_m = perception.world_size / FIELD_SCALE.env_scale
         self.max_speed_m_s = training.max_speed * FIELD_SCALE.velocity_scale
         self.to_mission: LocalTransform = ORIGIN.frame().relative_to(
@@ -106,14 +104,7 @@ class Layout:
         self.fence = fence_around(self.field_m, scenario.robots, scenario.budget)
         position_m = scenario.budget.position_m
         self.apart_m = places_apart(position_m, position_m).least_m
-        self.features = scenario.features
-        if self.features is None:
-            self.features = random_features(
-                # The first of the children that sim.experiment draws from.
-                np.random.default_rng(np.random.SeedSequence(scenario.seed).spawn(1)[0]),
-                scenario.random_feature_count,
-                perception.world_size,
-            )
+        self.features = scenario.draw_features(perception.world_size)
         self.vehicles: tuple[Px4Vehicle, ...] = ()
         if without_vehicles:
             exact_m = np.zeros((1, scenario.robots, 2))
@@ -148,18 +139,24 @@ class Layout:
     ) -> None:
         """fleet.toml, world.env, and robots/<i>/robot.toml in `folder`.
 
+        If the scenario's world or range differs from the bundle's, robots get a bundle of their
+        own there, which is where they read both.
+
         `robots` has what fleet.toml says of each robot besides its ids, by name, in their order.
         `settings` are further keys of robot.toml's tables, for all robots. The last `spares` lose
         their slots in fleet.toml, once their robot.toml is written. `keys`: a secure fleet has them
         in `folder`, where `write_keys` puts them. `radio` is fleet.toml's table of that name.
         """
-        assert self.features is not None
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "world.env").write_text(format_world(self.features))
         robot = robot_table(self.fence, self.max_speed_m_s, self.scenario.budget)
         robot["sensor"] = {"type": self.scenario.sensor}
-        for table, values in (settings or {}).items():
-            robot[table] = {**robot.get(table, {}), **values}
+        for further in (settings_of(self.scenario), settings or {}):
+            for table, values in further.items():
+                robot[table] = {**robot.get(table, {}), **values}
+        if self._has_own_sizes:
+            self.bundle_path = folder / "bundle"
+            write_bundle(self.bundle, self.bundle_path)
         config = write_fleet(
             folder / "fleet.toml",
             "Made by `lpac sim`: the robots are programs of this machine, without image or SSH.",
@@ -228,8 +225,8 @@ class Layout:
 
     def _draw_pads(self, biases_m: F64) -> F64:
         """Pads (N, 2) apart from each other, in truth and as robots with each (N, 2) see them."""
-        if self.scenario.pads_m is not None:
-            return np.array(self.scenario.pads_m)
+        if self.scenario.starts_m is not None:
+            return np.array(self.scenario.starts_m)
         rng = np.random.default_rng([self.scenario.seed, 1])
         robots, field_m = biases_m.shape[1], self.field_m
         pads_m = _pads_within(biases_m, field_m, self.apart_m, rng)
@@ -251,14 +248,14 @@ class Layout:
         return turned
 
 
-def pads_for_all(scenarios: Sequence[FleetScenario], bundle: Path, spare_m: float = 0.0) -> F64:
+def pads_for_all(scenarios: Sequence[Scenario], bundle: Path, spare_m: float = 0.0) -> F64:
     """Pads (N, 2) on which the robots of each scenario may stand, within `spare_m`.
 
     They are apart in truth, and as the receivers of each scenario see them; scenarios have the same
     numbers of robots, and the same budget. Raises ValueError if there is no room, BundleError.
     """
     nowhere_m = tuple((0.0, 0.0) for _ in range(scenarios[0].robots))
-    layouts = [Layout(replace(scenario, pads_m=nowhere_m), bundle) for scenario in scenarios]
+    layouts = [Layout(replace(scenario, starts_m=nowhere_m), bundle) for scenario in scenarios]
     apart_m, field_m = layouts[0].apart_m, layouts[0].field_m
     pads_m = _pads_within(
         np.stack([layout.landing_points_m for layout in layouts]),

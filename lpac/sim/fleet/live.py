@@ -16,16 +16,16 @@ from typing import NamedTuple, Self
 
 from edge.drivers.zenoh_link import ZenohLink
 from edge.messages.topics import ReceiveCallback
-from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.layout import Settings
 from lpac.sim.fleet.robots import (
     VEHICLE_STEP_S,
     OpenLink,
-    Settings,
     SimulatedRobot,
     SimulatedRobots,
 )
 from lpac.sim.ports import free_ports
 from lpac.sim.radio import Subscriptions
+from lpac.sim.scenario import Scenario
 
 # How often the clock is looked at; and how long the robots have been on when they are first heard.
 _LOOK_S = 0.01
@@ -48,7 +48,7 @@ class LiveFleet(SimulatedRobots):
 
     def __init__(
         self,
-        scenario: FleetScenario,
+        scenario: Scenario,
         folder: Path,
         bundle: Path,
         *,

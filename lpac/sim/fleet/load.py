@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Literal
 
 from edge.policy.bundle import load_bundle
-from lpac.sim.experiment import Scenario, fly
+from lpac.sim.experiment import fly
 from lpac.sim.programs import python_program
+from lpac.sim.scenario import Scenario
 
 # A robot's program takes as much of a processor, with its vehicle, as so many units of work a
 # second. A core does 27 a second; a PX4 takes 0.1 to 0.2 of one, and a robot's program beside it

@@ -1,18 +1,17 @@
 """A pilot who takes a robot of a simulated fleet out of the field, and brings it back."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
 from edge.core import F64
 from edge.messages.mission import FlightState, RobotStatus
 from lpac.ground.script import Perturbation
+from lpac.sim.failure import Failure
 from lpac.sim.fleet.layout import Layout
 from lpac.sim.px4.modes import Px4Mode
 
-# What robots' configuration says where a pilot may take them: PX4 obeys no other remote control.
-FOR_A_PILOT: Mapping[str, Mapping[str, object]] = {"failsafe": {"rc": "pilot"}}
 LOOKS_S = 0.1
 _GAIN_PER_S, _FASTEST_M_S = 0.8, 3.0
 # Beyond the fence's line; when the pilot turns back, and lets the sticks go, before the end.
@@ -40,41 +39,34 @@ class PilotedVehicle(Protocol):
         """Ask for a mode."""
 
 
-class PilotFlight(NamedTuple):
-    """From `from_s` of the mission on a pilot has a robot; at `until_s` it is to rejoin.
-
-    Meanwhile it was out of the fence, and is back at about where it was. s, from the mission's
-    start.
-    """
-
-    robot: int
-    from_s: float
-    until_s: float
-
-    @property
-    def perturbations(self) -> tuple[Perturbation, Perturbation]:
-        """What the ground orders: the pilot is given the robot, and it is taken back."""
-        robot = f"r{self.robot}"
-        return (
-            Perturbation(self.from_s, robot, "pilot"),
-            Perturbation(self.until_s, robot, "rejoin"),
+def perturbations(failures: Sequence[Failure]) -> tuple[Perturbation, ...]:
+    """What the ground orders: pilots are given the robots, and they are taken back."""
+    return tuple(
+        each
+        for failure in failures
+        for each in (
+            Perturbation(failure.from_s, f"r{failure.robot}", "pilot"),
+            Perturbation(failure.until_s, f"r{failure.robot}", "rejoin"),
         )
+    )
 
 
 class Pilot:
-    """Flies a robot by its sticks, by sight, at the height that it has.
+    """Fly a robot out of the fence by its sticks while it is away, and back to about where it was.
+
+    It keeps its height.
 
     `mission_began_s` is by the clock that `look` is told the time of.
     """
 
     def __init__(
-        self, vehicle: PilotedVehicle, layout: Layout, flight: PilotFlight, mission_began_s: float
+        self, vehicle: PilotedVehicle, layout: Layout, failure: Failure, mission_began_s: float
     ) -> None:
-        self.robot = flight.robot
+        self.robot = failure.robot
         self._vehicle = vehicle
         self._layout = layout
-        self._from_s = mission_began_s + flight.from_s
-        self._until_s = mission_began_s + flight.until_s
+        self._from_s = mission_began_s + failure.from_s
+        self._until_s = mission_began_s + failure.until_s
         self._taken_at_m: F64 | None = None
         self._out_m: F64 = np.zeros(3)
         self._over = False

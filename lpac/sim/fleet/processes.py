@@ -7,7 +7,6 @@ import socket
 import subprocess
 import time
 from collections import deque
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -19,11 +18,12 @@ from edge.core import F64
 from edge.core.counted import counted
 from edge.robot.config import Rates
 from lpac.sim.fleet.keys import write_keys
-from lpac.sim.fleet.layout import WORLD, FleetScenario, Layout
+from lpac.sim.fleet.layout import WORLD, Layout, Settings
 from lpac.sim.fleet.listener import FleetListener, Say
 from lpac.sim.fleet.vehicles import SimulatedVehicles, Vehicles
 from lpac.sim.ports import free_ports
 from lpac.sim.programs import python_program
+from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import Px4Build
 
 STOP_WITHIN_S = 3.0
@@ -216,12 +216,12 @@ class Fleet:
 
     def __init__(
         self,
-        scenario: FleetScenario,
+        scenario: Scenario,
         folder: Path,
         bundle_path: Path,
         *,
         px4_build: Path | None = None,
-        settings: Mapping[str, Mapping[str, object]] | None = None,
+        settings: Settings | None = None,
         say: Say = lambda _: None,
     ) -> None:
         """Prepare the fleet in `folder`: fleet.toml, world, a folder per robot. Starts nothing.
@@ -232,6 +232,7 @@ class Fleet:
         Raises ValueError if that one is no build, or there is no room for so many robots;
         BundleError for a bundle that cannot be loaded, or has no perception.
         """
+        scenario.require_default("programs in real time", "loss", "delay_s")
         self.layout = Layout(scenario, bundle_path, without_vehicles=px4_build is not None)
         self.folder = folder.resolve()
         self.fleet_toml = self.folder / "fleet.toml"

@@ -24,10 +24,11 @@ from edge.policy.family import VerifiedPolicy, verified
 from edge.robot.config import RobotConfig, load_config
 from edge.robot.log import open_log
 from edge.robot.node import Ports, RobotNode
-from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.layout import Layout, Settings
 from lpac.sim.fleet.recorded import RecordedPolicy, recorded_steps
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.radio import Subscriptions
+from lpac.sim.scenario import Scenario
 from lpac.sim.schedule import Recurrence, Schedule, WallClock
 
 # Of a vehicle's physics, unless somebody is content with less.
@@ -35,8 +36,6 @@ VEHICLE_STEP_S = 0.02
 # Of preflight and status.
 _CHORE_S = 0.25
 _WATCH_S = 0.1
-
-Settings = Mapping[str, Mapping[str, object]]
 
 
 class OpenLink(Link, Protocol):
@@ -185,7 +184,7 @@ class SimulatedRobots:
 
     def __init__(
         self,
-        scenario: FleetScenario,
+        scenario: Scenario,
         folder: Path,
         bundle: Path,
         *,
@@ -219,7 +218,6 @@ class SimulatedRobots:
         self._vehicle_step_s = vehicle_step_s
         self._logs = logs
         self._recorded = recorded
-        self._policy = load_verified_policy(bundle)
         self._sensors = ExitStack()
         self._rng = np.random.default_rng([scenario.seed, 2])
         layout.write(
@@ -236,6 +234,7 @@ class SimulatedRobots:
             settings=settings,
             spares=spares,
         )
+        self._policy = load_verified_policy(layout.bundle_path)
         self.vehicles = tuple(
             DirectVehicle(vehicle, robot + 1, self.schedule)
             for robot, vehicle in enumerate(layout.vehicles)

@@ -29,10 +29,11 @@ from lpac.ground.station.protocol import (
     Request,
     ServerMessage,
 )
-from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.layout import Settings
 from lpac.sim.fleet.members import SimulatedMembers
-from lpac.sim.fleet.robots import VEHICLE_STEP_S, Settings, SimulatedRobot, SimulatedRobots
+from lpac.sim.fleet.robots import VEHICLE_STEP_S, SimulatedRobot, SimulatedRobots
 from lpac.sim.radio import GROUND, Radio, RadioLink, Subscriptions
+from lpac.sim.scenario import Scenario
 from lpac.sim.schedule import Schedule, WallClock
 
 # Long after any date that a robot takes for a wrong clock.
@@ -51,7 +52,7 @@ class SimulatedFleet(SimulatedRobots):
 
     def __init__(
         self,
-        scenario: FleetScenario,
+        scenario: Scenario,
         folder: Path,
         bundle: Path,
         *,

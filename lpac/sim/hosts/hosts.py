@@ -17,8 +17,7 @@ import numpy as np
 
 from edge.core.world import format_world, random_features
 from lpac.fleet.writer import write_fleet
-from lpac.sim.description import fence_around, robot_table
-from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.description import FIELD_SCALE, fence_around, robot_table
 from lpac.sim.hosts.base import base_tree, require_tools
 from lpac.sim.hosts.host import MAVLINK_PORT, SimulatedHost, new_key
 from lpac.sim.hosts.rack import Rack

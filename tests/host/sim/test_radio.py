@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from lpac.sim.fleet.ground import GroundProgram
-from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.scenario import Scenario
 from tests.conftest import ROOT, SHIPPED
 from tests.needs import missing
 from tests.process.sim.fleet_rig import FleetRig
@@ -63,7 +63,7 @@ def in_own_network(*command_line: str) -> subprocess.CompletedProcess[str]:
 
 def _fly(folder: Path) -> None:
     """Fly until all are down, and write what was so from the loss on, a file for each robot."""
-    fleet = Fleet(FleetScenario(robots=ROBOTS), folder / "fleet", SHIPPED)
+    fleet = Fleet(Scenario(robots=ROBOTS), folder / "fleet", SHIPPED)
     assert fleet.simulated is not None
     for vehicle in fleet.simulated.vehicles:
         vehicle.parameters |= {

@@ -36,8 +36,9 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.processes import Fleet
+from lpac.sim.scenario import Scenario
 from tests.conftest import ROOT, SHIPPED
 from tests.needs import missing
 from tests.process.ground.browser import MOST_TRIES, live_map, opened
@@ -70,7 +71,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     that loses much a takeoff is ordered again late: so they may take off within five minutes, which
     asks for heights further apart.
     """
-    scenario = FleetScenario(robots=len(NAMES), budget=PATIENT)
+    scenario = Scenario(robots=len(NAMES), budget=PATIENT)
     made = Fleet(scenario, tmp_path_factory.mktemp("fleet"), SHIPPED)
     assert made.simulated is not None
     for vehicle in made.simulated.vehicles:

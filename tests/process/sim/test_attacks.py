@@ -28,9 +28,9 @@ from edge.messages.topics import ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
 from lpac.fleet.authority import Authority, create_authority, new_member
 from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
-from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.scenario import Scenario
 from tests.command import error_line, lpac
 from tests.conftest import SHIPPED
 from tests.flown import QUICK
@@ -49,7 +49,7 @@ Repeated = Callable[[Callable[[], None]], None]
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetRig]:
     """A fleet with keys, in its mission."""
-    scenario = FleetScenario(robots=len(ROBOTS), secure=True)
+    scenario = Scenario(robots=len(ROBOTS), secure=True)
     fleet = Fleet(scenario, tmp_path_factory.mktemp("secure"), SHIPPED)
     assert fleet.simulated is not None
     for vehicle in fleet.simulated.vehicles:

@@ -23,9 +23,10 @@ from lpac.sim.drill.bounds import judge
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.field import DrilledRobots
 from lpac.sim.drill.simulated import SimulatedDrill
-from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.layout import Layout
 from lpac.sim.fleet.robots import SimulatedWatchdog
 from lpac.sim.fleet.simulated import SimulatedFleet
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 
 # Each flies as many robots as it shows with.
@@ -107,7 +108,7 @@ def landing_points_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @cache
 def _landing_points_m() -> list[tuple[float, float]]:
-    layout = Layout(FleetScenario(robots=PAIR, seed=0), SHIPPED)
+    layout = Layout(Scenario(robots=PAIR, seed=0), SHIPPED)
     return [(float(x), float(y)) for x, y in layout.landing_points_m]
 
 

@@ -26,10 +26,10 @@ from lpac.ground.station.config import load_ground
 from lpac.paper.experiments import absences_of
 from lpac.paper.flown import fly_programs
 from lpac.sim.description import ERRORS
-from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.failure import Failure
 from lpac.sim.fleet.listener import FleetListener
-from lpac.sim.fleet.pilot import PilotFlight
 from lpac.sim.fleet.processes import Fleet, SimulatedFleetError
+from lpac.sim.scenario import Scenario
 from tests.command import error_line, lpac
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE
@@ -157,7 +157,7 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lpac.sim.fleet.processes.STOP_WITHIN_S", 60.0)
-    with Fleet(FleetScenario(robots=2), tmp_path, SHIPPED) as fleet:
+    with Fleet(Scenario(robots=2), tmp_path, SHIPPED) as fleet:
         assert fleet.heard.wait_for(lambda statuses: len(statuses) == 2, 60.0)
         before = fleet.heard.statuses()[1].boot_nonce
         fleet.robots[1].send_signal(signal.SIGKILL)
@@ -176,7 +176,7 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
 
 @pytest.mark.real_time
 def test_a_fleet_meets_at_its_router_and_finds_it_again(tmp_path: Path) -> None:
-    scenario = FleetScenario(robots=2, secure=True, transport="router")
+    scenario = Scenario(robots=2, secure=True, transport="router")
     with Fleet(scenario, tmp_path, SHIPPED) as fleet:
         config = load_ground(fleet.fleet_toml, None)
         assert config.mode == "client" and len(config.connect) == 1
@@ -196,7 +196,7 @@ def test_a_fleet_meets_at_its_router_and_finds_it_again(tmp_path: Path) -> None:
 
 @pytest.mark.real_time
 def test_with_multicast_robots_hear_each_other_without_the_router(tmp_path: Path) -> None:
-    scenario = FleetScenario(robots=2, secure=True, transport="multicast")
+    scenario = Scenario(robots=2, secure=True, transport="multicast")
     with Fleet(scenario, tmp_path, SHIPPED) as fleet:
         assert fleet.router is not None
         for robot in fleet.robots:
@@ -213,14 +213,15 @@ def test_with_multicast_robots_hear_each_other_without_the_router(tmp_path: Path
 @pytest.mark.real_time
 def test_a_pilot_takes_a_robot_out_of_the_fence_and_back(tmp_path: Path) -> None:
     """As tests/sim/sim/test_pilot.py has it on the simulated clock."""
-    taken = PilotFlight(robot=0, from_s=1.0, until_s=19.0)
-    scenario = FleetScenario(
-        robots=2, seed=3, duration_s=22.0, secure=True, transport="router", budget=PRECISE
-    )
-    record = fly_programs(scenario, tmp_path, SHIPPED, pilots=[taken])
+    taken = Failure(robot=0, from_s=1.0, until_s=19.0)
+    scenario = Scenario(
+        robots=2, seed=3, duration_s=22.0, secure=True, transport="router", budget=PRECISE,
+        failures=(taken,),
+    )  # fmt: skip
+    record = fly_programs(scenario, tmp_path, SHIPPED)
     [absence] = absences_of(record)
     assert absence.robot == "r0"
-    assert np.allclose((absence.from_s, absence.until_s), taken[1:], atol=3.0)
+    assert np.allclose((absence.from_s, absence.until_s), (taken.from_s, taken.until_s), atol=3.0)
     truth, fence = record.truth["r0"], record.fence
     assert fence is not None
     away = (truth.time_s > absence.from_s) & (truth.time_s < absence.until_s)
@@ -265,7 +266,7 @@ def pid_of(arguments: str) -> int:
 @pytest.mark.parametrize("robots", [1, 16])
 def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -> None:
     """The ground reads fleet.toml, the robots their robot.toml."""
-    fleet = Fleet(FleetScenario(robots=robots, seed=robots), tmp_path, SHIPPED)
+    fleet = Fleet(Scenario(robots=robots, seed=robots), tmp_path, SHIPPED)
     config = load_fleet(fleet.fleet_toml)
     assert config.bundle == SHIPPED and config.world == tmp_path / "world.env"
     assert list(config.robots) == [f"r{i}" for i in range(robots)]

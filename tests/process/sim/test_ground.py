@@ -9,16 +9,17 @@ from edge.messages.topics import STATUS
 from lpac.ground.station.client import GroundError, socket_path
 from lpac.ground.station.protocol import Enable, ProblemCode, ResultCode, SetOrigin
 from lpac.sim.fleet.ground import GroundProgram
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.listener import FleetListener
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.ports import free_ports
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 from tests.said import not_done, problem
 
 
 def test_it_is_a_ground_as_any_other_until_it_ends(tmp_path: Path) -> None:
-    fleet = Fleet(FleetScenario(robots=2), tmp_path, SHIPPED)
+    fleet = Fleet(Scenario(robots=2), tmp_path, SHIPPED)
     left = socket_path(fleet.name).parent
     with GroundProgram(fleet.fleet_toml, fleet.name) as ground:
         assert [robot.name for robot in ground.told.snapshot.robots] == ["r0", "r1"]

@@ -6,9 +6,9 @@ import pytest
 
 from lpac.sim.fleet import load
 from lpac.sim.fleet.flight import fly, summary_lines
-from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.load import robots_carried
 from lpac.sim.fleet.processes import OVERLOADED_S, Fleet
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 
 STEPS = (
@@ -33,7 +33,7 @@ def test_a_flight_that_falls_behind_ends_early_and_says_so_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_the_air: bool
 ) -> None:
     said: list[str] = []
-    fleet = Fleet(FleetScenario(robots=2), tmp_path, SHIPPED, say=said.append)
+    fleet = Fleet(Scenario(robots=2), tmp_path, SHIPPED, say=said.append)
     assert fleet.simulated is not None
     vehicles = fleet.simulated.vehicles
 

@@ -28,18 +28,19 @@ from lpac.ground.station.client import subscribe
 from lpac.ground.station.commands import in_words
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.cores import over_cores
-from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.description import FIELD_SCALE
 from lpac.sim.fleet.ground import GroundProgram
-from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.layout import Layout
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.fleet.scripted import CommandOutcome, ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 
 # It measures how alike they are: beside another flight, programs are late.
 pytestmark = pytest.mark.alone
 
-SCENARIO = FleetScenario(robots=3, seed=1, duration_s=20.0)
+SCENARIO = Scenario(robots=3, seed=1, duration_s=20.0)
 # A machine that holds up a program is not what is compared.
 MOST_FLIGHTS = 3
 STARTING_S = 2.0

@@ -28,9 +28,10 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.radio import RadioLink
+from lpac.sim.scenario import Scenario
 from tests.command import called
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE, QUICK
@@ -146,8 +147,8 @@ class Stages(NamedTuple):
 def stages(tmp_path_factory: pytest.TempPathFactory) -> Stages:
     """Three robots and a spare, with noses along the y axis."""
     folder = tmp_path_factory.mktemp("field")
-    scenario = FleetScenario(
-        robots=4, seed=3, errors=False, budget=PRECISE, pads_m=(*PADS_M, (14.0, 2.0))
+    scenario = Scenario(
+        robots=4, seed=3, errors=False, budget=PRECISE, starts_m=(*PADS_M, (14.0, 2.0))
     )
     fleet = SimulatedFleet(
         scenario, folder, SHIPPED, operator="alice", settings=SPARING, spares=1, vehicle_step_s=0.1

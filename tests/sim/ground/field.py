@@ -26,12 +26,13 @@ from lpac.ground.station.protocol import (
     Takeoff,
 )
 from lpac.ground.station.station import Station
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.robots import SimulatedRobot
 from lpac.sim.fleet.simulated import SimulatedFleet
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.radio import Air
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 from tests.flown import PRECISE, QUICK, FlownRobot
 
@@ -197,7 +198,7 @@ def _flown(n: int, spares: int, stage: Stage, secure: bool) -> Field:
     """The fleet that others are copies of."""
     if stage == "standing":
         with tempfile.TemporaryDirectory() as folder:
-            scenario = FleetScenario(
+            scenario = Scenario(
                 robots=n + spares, seed=3, errors=False, budget=PRECISE, secure=secure
             )
             fleet = SimulatedFleet(

@@ -27,8 +27,10 @@ from lpac.radio.modelled import ModelledRadio
 from lpac.sim.batch import BatchedFlights, PolicyFailedError, fly_batch
 from lpac.sim.batch.agents import SingleAgents
 from lpac.sim.batch.seen import SeenMap, ShownWorld
-from lpac.sim.experiment import FIELD_SCALE, Scenario, SimulatedFlight, fly
+from lpac.sim.description import FIELD_SCALE
+from lpac.sim.experiment import SimulatedFlight, fly
 from lpac.sim.failure import Failure
+from lpac.sim.scenario import Scenario
 from lpac.sim.swarm import ClockedPac
 from lpac.sim.ticks import Clocks
 

@@ -11,8 +11,9 @@ from edge.core.world import GaussianFeature
 from edge.policy.bundle import Bundle, BundleError
 from lpac.radio.airtime import Wifi
 from lpac.radio.modelled import ModelledRadio
-from lpac.sim.experiment import Controller, FlightMoment, Scenario, SimulatedFlight, fly
+from lpac.sim.experiment import FlightMoment, SimulatedFlight, fly
 from lpac.sim.failure import Failure
+from lpac.sim.scenario import Controller, Scenario
 from lpac.sim.ticks import Clocks
 
 CONTROLLERS: tuple[Controller, ...] = (

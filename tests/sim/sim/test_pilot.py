@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 
 from lpac.paper.experiments import absences_of, perturbed_by
+from lpac.sim.failure import Failure
 from lpac.sim.fleet.clocked import fly_simulated
-from lpac.sim.fleet.layout import FleetScenario
-from lpac.sim.fleet.pilot import PilotFlight
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 
 
 @pytest.mark.slow
 def test_it_is_out_of_the_fence_and_back_in_its_mission(tmp_path: Path) -> None:
-    taken = PilotFlight(robot=0, from_s=3.0, until_s=23.0)
-    scenario = FleetScenario(robots=2, seed=3, duration_s=28.0)
-    flown = fly_simulated(scenario, tmp_path, SHIPPED, pilots=[taken])
+    taken = Failure(robot=0, from_s=3.0, until_s=23.0)
+    scenario = Scenario(robots=2, seed=3, duration_s=28.0, failures=(taken,))
+    flown = fly_simulated(scenario, tmp_path, SHIPPED)
     assert (flown.problem, flown.all_landed) == (None, True)
     [absence] = absences_of(flown.record)
     assert absence.robot == "r0"
     # It says so with its next status, and the script sees it with the next picture.
-    assert np.allclose((absence.from_s, absence.until_s), taken[1:], atol=2.0)
+    assert np.allclose((absence.from_s, absence.until_s), (taken.from_s, taken.until_s), atol=2.0)
     truth = flown.robots[0].truth
     time_s = truth.time_s - (flown.record.begin_s - flown.start_unix_s)
     away = (time_s > absence.from_s) & (time_s < absence.until_s)

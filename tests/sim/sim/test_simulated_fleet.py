@@ -41,16 +41,15 @@ from lpac.ground.station.protocol import (
 )
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
-from lpac.sim.fleet.pilot import FOR_A_PILOT
+from lpac.sim.fleet.layout import ORIGIN, Settings
 from lpac.sim.fleet.recorded import RecordingError
-from lpac.sim.fleet.robots import Settings
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon
 from lpac.sim.radio import GROUND
+from lpac.sim.scenario import Scenario
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE
 
@@ -62,14 +61,12 @@ STEP_S = 0.05
 
 def a_fleet(folder: Path, seed: int = 3, robots: int = 3) -> SimulatedFleet:
     """As fleets are simulated."""
-    return SimulatedFleet(FleetScenario(robots=robots, seed=seed), folder, SHIPPED)
+    return SimulatedFleet(Scenario(robots=robots, seed=seed), folder, SHIPPED)
 
 
-def low_flight(robots: int, seed: int, duration_s: float) -> FleetScenario:
+def low_flight(robots: int, seed: int, duration_s: float) -> Scenario:
     """Robots that know where they are fly low, and are soon up and down."""
-    return FleetScenario(
-        robots=robots, seed=seed, duration_s=duration_s, errors=False, budget=PRECISE
-    )
+    return Scenario(robots=robots, seed=seed, duration_s=duration_s, errors=False, budget=PRECISE)
 
 
 def a_low_fleet(folder: Path) -> SimulatedFleet:
@@ -102,9 +99,9 @@ def to_mission(ground: SimulatedGround) -> Procedure[None]:
 
 @cache
 def _in_mission(for_a_pilot: bool = False) -> SimulatedFleet:
-    settings: Settings = {**SELDOM, **(FOR_A_PILOT if for_a_pilot else {})}
+    settings: Settings = {**SELDOM, "failsafe": {"rc": "pilot" if for_a_pilot else "none"}}
     with tempfile.TemporaryDirectory() as folder:
-        scenario = FleetScenario(robots=2, seed=3)
+        scenario = Scenario(robots=2, seed=3)
         fleet = SimulatedFleet(
             scenario, Path(folder), SHIPPED, settings=settings, vehicle_step_s=STEP_S
         )
@@ -472,7 +469,7 @@ def test_a_bad_link_to_the_autopilot_is_told(
 
 
 def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
-    scenario = FleetScenario(robots=2, seed=3)
+    scenario = Scenario(robots=2, seed=3)
     fleet = SimulatedFleet(
         scenario, tmp_path, SHIPPED, absent=1, settings=SELDOM, vehicle_step_s=STEP_S
     )
@@ -577,7 +574,7 @@ class _Listener(ScriptListener):
 @pytest.mark.slow
 def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
     def flown(name: str) -> FleetFlight:
-        scenario = FleetScenario(robots=2, seed=4, duration_s=10.0)
+        scenario = Scenario(robots=2, seed=4, duration_s=10.0)
         return fly_simulated(scenario, tmp_path / name, SHIPPED)
 
     flight, again = flown("first"), flown("again")
@@ -796,7 +793,7 @@ def test_recorded_steps_of_the_policy_are_the_same_flight(
 
 
 def test_records_of_another_flight_are_refused(tmp_path: Path, logged: Logged) -> None:
-    def recorded(scenario: FleetScenario, folder: Path) -> None:
+    def recorded(scenario: Scenario, folder: Path) -> None:
         fly_simulated(scenario, tmp_path / "flown", SHARING, recorded=folder)
 
     with pytest.raises(RecordingError, match="has no flight log of robot 2"):

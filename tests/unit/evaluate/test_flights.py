@@ -16,15 +16,16 @@ from lpac.evaluate.flights import (
     EvaluationFlight,
     FlownCost,
     KeptFlights,
-    bundle_for,
     costs_of,
     fly_group,
+    whole_scenario,
 )
 from lpac.evaluate.worlds import FIELD, SET_UPS, draw_world
 from lpac.radio.airtime import Wifi
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.cores import Outcome, in_this_process
 from lpac.sim.failure import LostRobots
+from lpac.sim.fleet.layout import Layout
 from lpac.sim.ticks import Clocks
 from tests.conftest import SHIPPED
 
@@ -87,11 +88,22 @@ def test_whole_robots_begin_where_points_from_pads_do(flight: EvaluationFlight) 
 def test_whole_robots_fly_a_bundle_of_their_set_ups_world_and_range(
     flight: EvaluationFlight, tmp_path: Path
 ) -> None:
-    assert bundle_for(flight, tmp_path) == SHIPPED
-    other = dataclasses.replace(flight, set_up="n3")
-    perception = load_bundle(bundle_for(other, tmp_path)).manifest.perception
-    assert perception is not None
-    assert perception.world_size == SET_UPS["n3"].world_size < FIELD.world_size
+    for set_up, own in (("field", False), ("n3", True)):
+        layout = Layout(whole_scenario(dataclasses.replace(flight, set_up=set_up)), SHIPPED)
+        robots: dict[str, dict[str, object]] = {
+            f"r{i}": {
+                "system_id": i + 1,
+                "mavlink_url": f"udpin://127.0.0.1:{14551 + i}",
+                "zenoh_port": 7447 + i,
+            }
+            for i in range(SET_UPS[set_up].robots)
+        }
+        layout.write(tmp_path, "fleet", robots)
+        assert (layout.bundle_path == SHIPPED) is not own
+        perception = load_bundle(layout.bundle_path).manifest.perception
+        assert perception is not None
+        assert perception.world_size == SET_UPS[set_up].world_size
+    assert SET_UPS["n3"].world_size < FIELD.world_size
 
 
 def test_the_best_of_ten_is_no_more_than_clairvoyants(flight: EvaluationFlight) -> None:

@@ -15,7 +15,7 @@ from lpac.analysis.flight import FlightRecord
 from lpac.analysis.logs import LoopRates
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.evaluate.evaluation import TrainedBundle
-from lpac.evaluate.flights import EvaluationFlight, FlownCost, costs_of, settings_of
+from lpac.evaluate.flights import EvaluationFlight, FlownCost, costs_of, whole_scenario
 from lpac.paper.asynchrony import (
     FIELD,
     TIMES_S,
@@ -27,6 +27,7 @@ from lpac.paper.asynchrony import (
     results_of_logs,
 )
 from lpac.paper.asynchrony_report import write_report
+from lpac.sim.fleet.layout import settings_of
 
 SHIPPED_ID = load_bundle(DEFAULT_BUNDLE).id
 PLAN = AsynchronyPlan(
@@ -94,7 +95,7 @@ def test_in_real_time_messages_are_as_late_as_their_radio_makes_them(tmp_path: P
     assert not (tmp_path / "staleness.png").exists()
     [late] = replace(plan, worlds=1).flights_of(FIELD._replace(delay_s=0.4))
     late = replace(late, bundle=str(DEFAULT_BUNDLE), flown_by=SHIPPED_ID)
-    with pytest.raises(ValueError, match="the radio of programs in real time is what it is"):
+    with pytest.raises(ValueError, match=r"delay_s = 0.4: must be 0.0 for programs in real time"):
         costs_of((late,))
 
 
@@ -143,7 +144,7 @@ def test_whole_robots_have_the_rates_and_ages_of_a_timing() -> None:
     costs = {}
     for timing in (FIELD, Timing(5.0, 0.5)):
         [flight] = plan.flights_of(timing)
-        settings = settings_of(flight)
+        settings = settings_of(whole_scenario(flight))
         assert settings["rates"]["policy_hz"] == pytest.approx(timing.policy_hz)
         assert settings["rates"]["perception_hz"] == 5.0
         assert settings["policy"]["max_message_age_s"] == flight.max_message_age_s
@@ -152,7 +153,7 @@ def test_whole_robots_have_the_rates_and_ages_of_a_timing() -> None:
     assert field.time_s == slow.time_s == (0.0, 1.0, 2.0, 3.0, 4.0)
     assert field.cost[0] == pytest.approx(slow.cost[0], rel=1e-3) and field.cost != slow.cost
     at_once = replace(flight, clocks=replace(flight.clocks, synchronous=True))
-    with pytest.raises(ValueError, match="whole robots have moments of their own"):
+    with pytest.raises(ValueError, match="synchronous = True: must be False for whole robots"):
         costs_of((at_once,))
 
 

@@ -21,7 +21,8 @@ from lpac.cli.options import DEFAULT_BUNDLE, VehicleKind
 from lpac.cli.paper import asynchrony, e1, e2, e3, transfer
 from lpac.evaluate.flights import BASELINES
 from lpac.paper.report import LOGS, write_network, write_transfer
-from lpac.sim.experiment import Scenario, fly
+from lpac.sim.experiment import fly
+from lpac.sim.scenario import Scenario
 
 pytestmark = pytest.mark.usefixtures("sketched")
 

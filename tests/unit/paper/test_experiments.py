@@ -45,7 +45,8 @@ from lpac.paper.report import (
     write_transferability,
 )
 from lpac.sim.cores import in_this_process
-from lpac.sim.experiment import FIELD_SCALE, fly
+from lpac.sim.description import FIELD_SCALE
+from lpac.sim.experiment import fly
 from lpac.sim.failure import Failure
 from lpac.sim.fleet.layout import Layout
 
@@ -210,13 +211,13 @@ def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
     pads_m = pads_of(DEFAULT_BUNDLE)
     for world, scenario in plan.items():
         assert scenario.features == points[world]["lpac"].features
-        np.testing.assert_array_equal(scenario.pads_m, pads_m)
+        np.testing.assert_array_equal(scenario.starts_m, pads_m)
     trials = list(whole_repeatability(DEFAULT_BUNDLE, 3).values())
-    assert len({trial.seed for trial in trials}) == len({trial.pads_m for trial in trials}) == 3
+    assert len({trial.seed for trial in trials}) == len({trial.starts_m for trial in trials}) == 3
     for one, other in pairwise(trials):
-        offsets_m = np.array(one.pads_m) - np.array(other.pads_m)
+        offsets_m = np.array(one.starts_m) - np.array(other.starts_m)
         assert np.linalg.norm(offsets_m, axis=1).max() <= 2.0 * PLACED_WITHIN_M
-    perturbed_elsewhere, _ = whole_perturbation(DEFAULT_BUNDLE, 1)
+    perturbed_elsewhere = whole_perturbation(DEFAULT_BUNDLE, 1)
     for scenario in (*plan.values(), *trials, perturbed_elsewhere):
         # Or the ground refuses the fleet.
         layout = Layout(scenario, DEFAULT_BUNDLE)
@@ -225,9 +226,9 @@ def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
             assert min(apart_m) >= layout.apart_m
 
     few = [
-        replace(trial, robots=2, pads_m=trial.pads_m[:2], duration_s=3.0)
+        replace(trial, robots=2, starts_m=trial.starts_m[:2], duration_s=3.0)
         for trial in trials[:2]
-        if trial.pads_m
+        if trial.starts_m
     ]
 
     records = {str(n): record for n, record in fly_whole(few, DEFAULT_BUNDLE, in_this_process)}

@@ -8,15 +8,16 @@ import pytest
 
 from edge.core.world import parse_world
 from edge.policy.bundle import Bundle
-from lpac.sim.experiment import Scenario, fly
-from lpac.sim.fleet.layout import APART_M, FleetScenario, Layout
+from lpac.sim.experiment import fly
+from lpac.sim.fleet.layout import APART_M, Layout
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("robots", [1, 10, 16])
 def test_where_a_fleet_stands(seed: int, robots: int) -> None:
-    layout = Layout(FleetScenario(robots=robots, seed=seed), SHIPPED)
+    layout = Layout(Scenario(robots=robots, seed=seed), SHIPPED)
     for places_m in (layout.pads_m, layout.landing_points_m):
         assert min(layout.fence.distance_m(x, y) for x, y in places_m) > layout.fence.buffer_m
         away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
@@ -32,17 +33,17 @@ def test_more_robots_than_fit_are_refused_with_how_many_do() -> None:
     with pytest.raises(
         ValueError, match=r"robots = 20: (\d+) fit on 32 x 32 m, with pads 8 m apart"
     ) as refused:
-        Layout(FleetScenario(robots=20), SHIPPED)
+        Layout(Scenario(robots=20), SHIPPED)
     (fit,) = map(int, re.findall(r": (\d+) fit", str(refused.value)))
-    assert Layout(FleetScenario(robots=fit), SHIPPED).pads_m.shape == (fit, 2)
+    assert Layout(Scenario(robots=fit), SHIPPED).pads_m.shape == (fit, 2)
     # Twenty that know where they are stand on the same field.
-    Layout(FleetScenario(robots=20, errors=False), SHIPPED)
+    Layout(Scenario(robots=20, errors=False), SHIPPED)
 
 
 def test_a_seed_has_the_world_of_the_swarm_in_simulated_time(
     tmp_path: Path, shipped_bundle: Bundle
 ) -> None:
-    layout = Layout(FleetScenario(robots=1, seed=11), SHIPPED)
+    layout = Layout(Scenario(robots=1, seed=11), SHIPPED)
     swarm = fly(Scenario(robots=1, seed=11, duration_s=0.1), shipped_bundle)
     assert layout.features == swarm.features
     r0 = {"zenoh_port": 7447, "system_id": 1, "mavlink_url": "udpin://127.0.0.1:14551"}

@@ -8,9 +8,8 @@ import pytest
 
 from edge.policy.bundle import load_bundle
 from lpac.shipped import SHIPPED_BUNDLE
-from lpac.sim.experiment import Scenario
 from lpac.sim.fleet.flight import _fence_line
-from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.scenario import Scenario
 from lpac.sim.usual import USUAL_JSON, Usual, judgement, usual_points, usual_whole
 
 BUNDLE_ID = load_bundle(SHIPPED_BUNDLE).id
@@ -49,14 +48,14 @@ def test_only_flights_like_those_that_were_flown_are_compared() -> None:
     assert usual_points(Scenario(seed=7), BUNDLE_ID) is not None
     assert usual_points(Scenario(seed=7, loss=0.3), BUNDLE_ID) is None
     assert usual_points(Scenario(seed=7), "another") is None
-    whole = FleetScenario(seed=5, robots=4, duration_s=50.0)
+    whole = Scenario(seed=5, robots=4, duration_s=50.0)
     near = usual_whole(replace(whole, secure=True), BUNDLE_ID)
     assert near is not None and near.robots in (3, 5)
     assert usual_whole(replace(whole, errors=False), BUNDLE_ID) is None
     assert usual_whole(replace(whole, duration_s=20.0), BUNDLE_ID) is None
     assert usual_whole(replace(whole, random_feature_count=3), BUNDLE_ID) is None
     pads_m = tuple((4.0 * i, 4.0) for i in range(4))
-    assert usual_whole(replace(whole, pads_m=pads_m), BUNDLE_ID) is None
+    assert usual_whole(replace(whole, starts_m=pads_m), BUNDLE_ID) is None
 
 
 @pytest.mark.parametrize(

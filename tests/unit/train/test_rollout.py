@@ -17,7 +17,7 @@ from edge.core.world import random_features, rasterize
 from edge.policy.bundle import Bundle
 from lpac.evaluate.worlds import FIELD, draw_world
 from lpac.sim.batch import BatchedFlights, fly_batch
-from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.description import FIELD_SCALE
 from lpac.train.config import DaggerConfig, DataConfig, Disturbances, ExpertName, WorldRanges
 from lpac.train.data import Dataset, Shards
 from lpac.train.expert import Expert, assignment, make_expert
