@@ -33,7 +33,7 @@ LOWEST := out/lowest
 check-lowest: $(LOWEST)/installed ## unit and sim tests with Python 3.11 and the lowest versions that pyproject.toml allows
 	$(LOWEST)/bin/pytest -W ignore::DeprecationWarning $(QUICK)
 
-test: lint ## style, types, and every test; as root with real robot hosts too: 22 minutes on two cores
+test: lint ## style, types, and every test; as root with real robot hosts too: 19 minutes on two cores
 	@tests/all.sh
 
 redteam: .venv/test ## attacks on a fleet with keys and on one without: docs/security.md, "Attacks that were tried"

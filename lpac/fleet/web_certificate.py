@@ -27,6 +27,11 @@ _NETWORKS = tuple(
          "::1/128", "fc00::/7", "fe80::/10"),
     )
 )  # fmt: skip
+_SIGNS_CERTIFICATES = x509.KeyUsage(
+    digital_signature=False, content_commitment=False, key_encipherment=False,
+    data_encipherment=False, key_agreement=False, key_cert_sign=True, crl_sign=False,
+    encipher_only=False, decipher_only=False,
+)  # fmt: skip
 _DAY = datetime.timedelta(days=1)
 # Some browsers take none that is good for longer.
 _MAP_VALID = 397 * _DAY
@@ -64,6 +69,9 @@ def web_certificate(
         _unsigned(_name(authority.fleet, "map"), issuer.subject, key, now, _MAP_VALID)
         .add_extension(x509.BasicConstraints(False, None), True)
         .add_extension(names, False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()), False
+        )
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), False)
         .sign(issuer_key, hashes.SHA256())
     )
@@ -78,6 +86,7 @@ def _make_authority(authority: Authority, now: datetime.datetime) -> None:
     certificate = (
         _unsigned(name, name, key, now, _AUTHORITY_VALID)
         .add_extension(x509.BasicConstraints(True, 0), True)
+        .add_extension(_SIGNS_CERTIFICATES, True)
         .add_extension(
             # Without a name that is permitted, all names would be.
             x509.NameConstraints(
@@ -108,6 +117,7 @@ def _unsigned(
         # The tablet's clock may be behind.
         .not_valid_before(now - _DAY)
         .not_valid_after(now - _DAY + valid)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False)
     )
 
 

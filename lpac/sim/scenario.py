@@ -88,8 +88,10 @@ class Scenario:
     transport: Transport = "mesh"
 
     def __post_init__(self) -> None:
-        if not 1 <= self.robots <= MAX_ROBOTS:
-            raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
+        if self.robots < 1:
+            raise ValueError(f"robots = {self.robots}: must be at least 1")
+        if self.robots > MAX_ROBOTS:
+            raise ValueError(f"robots = {self.robots}: must be at most {MAX_ROBOTS}")
         if self.seed < 0:
             raise ValueError(f"seed = {self.seed}: must be at least 0")
         for name, of_each in (("starts_m", self.starts_m), ("position_bias", self.position_bias)):

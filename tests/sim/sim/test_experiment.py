@@ -231,7 +231,7 @@ def test_what_the_swarm_does_depends_on_its_messages(shipped_bundle: Bundle) -> 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"robots": 0}, "robots = 0: must be from 1 to 65536"),
+        ({"robots": 0}, "robots = 0: must be at least 1"),
         ({"duration_s": -1.0}, "duration = -1.0: must be positive"),
         ({"random_feature_count": -1}, "features = -1"),
         ({"loss": 1.5}, "loss = 1.5: must be from 0 to 1"),

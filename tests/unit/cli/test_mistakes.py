@@ -12,7 +12,7 @@ from tests.conftest import SHIPPED
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["sim", "--robots", "0"], "--robots 0: must be from 1 to 65536"),
+        (["sim", "--robots", "0"], "--robots 0: must be at least 1"),
         (["sim", "--seed", "-1"], "--seed -1: must be at least 0"),
         (["sim", "--world", "docs/demo.png"], "docs/demo.png: is not a text file"),
         (["sim", "--out", "README.md"], "README.md"),
