@@ -25,7 +25,7 @@ setup: .venv/sim .venv/export .venv/fleet .venv/ground .venv/foxglove ## install
 # Files that take long come first; tests of one file share what they fly.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 QUICK := --numprocesses auto $(BY_FILE) tests/sim tests/unit
-check: lint ## style, types, and the quick tests: what a commit has to pass, in three minutes on two cores
+check: lint ## style, types, and the quick tests: what a commit has to pass, in two and a half minutes on two cores
 	.venv/bin/pytest $(QUICK) -m 'not slow'
 
 LOWEST := out/lowest
@@ -33,7 +33,9 @@ LOWEST := out/lowest
 check-lowest: $(LOWEST)/installed ## unit and sim tests with Python 3.11 and the lowest versions that pyproject.toml allows
 	$(LOWEST)/bin/pytest -W ignore::DeprecationWarning $(QUICK)
 
-test: lint ## style, types, and every test; as root with real robot hosts too: 19 minutes on two cores
+test: .venv/test ## style, types, and every test; as root with real robot hosts too: 19 minutes on two cores
+	@$(RUN) tests.quiet
+	@$(MAKE) --no-print-directory lint
 	@tests/all.sh
 
 redteam: .venv/test ## attacks on a fleet with keys and on one without: docs/security.md, "Attacks that were tried"

@@ -14,7 +14,6 @@ some() {
 
 # Unit and sim tests run on what the others leave of the processor. An idle process shares it with
 # its own session's processes only after them, so its session as a whole has to give way too.
-.venv/bin/python -m tests.quiet || exit 1
 setsid sh -c 'echo 19 > /proc/self/autogroup; exec chrt --idle 0 "$@"' sh \
   .venv/bin/pytest --skipped out/skipped --numprocesses auto $by_file tests/sim tests/unit \
   > out/quick.txt 2>&1 &
