@@ -36,7 +36,7 @@ check-lowest: $(LOWEST)/installed ## unit and sim tests with Python 3.11 and the
 test: .venv/test ## style, types, and every test; as root with real robot hosts too: 19 minutes on two cores
 	@$(RUN) tests.quiet
 	@$(MAKE) --no-print-directory lint
-	@tests/all.sh
+	@tests/all.sh $(BY_FILE)
 
 redteam: .venv/test ## attacks on a fleet with keys and on one without: docs/security.md, "Attacks that were tried"
 	.venv/bin/pytest -v --tries 1000 tests/sim/ground/test_attacks.py tests/process/sim/test_attacks.py \

@@ -1,10 +1,11 @@
 #!/bin/sh
 # Run every test in the parts that README.md describes; exit with 1 if any of them failed.
+# Arguments: pytest's options for tests that are distributed by file.
 cd "$(dirname "$0")/.." || exit 1
 mkdir -p out
 rm -f out/skipped
 failed=0
-by_file='--dist loadfile --no-loadscope-reorder'
+by_file=$*
 
 some() {
   .venv/bin/python -m tests.quiet || exit 1

@@ -109,8 +109,8 @@ def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dic
 
 def _datagram(packet: bytes, port: int) -> bytes:
     """What an IPv4 packet carries to a UDP port; nothing if it is another packet."""
-    header = max(20, 4 * (packet[0] & 0x0F)) if packet else 0
-    if len(packet) < header + 8 or packet[9] != socket.IPPROTO_UDP:
+    header = 4 * (packet[0] & 0x0F) if packet else 0
+    if header < 20 or len(packet) < header + 8 or packet[9] != socket.IPPROTO_UDP:
         return b""
     _, destination = struct.unpack_from("!HH", packet, header)
     return packet[header + 8 :] if destination == port else b""

@@ -274,14 +274,14 @@ class Flown:
         self.control.peers = tuple(HeardBeacon(beacon, at_s) for beacon in beacons)
 
     def inputs(self) -> FlightInputs:
-        """What the last tick knew."""
+        """Inputs of the last tick."""
         topic, message = self.records[-1]
         assert topic == "flight"
         inputs: FlightInputs = message["given"].inputs
         return inputs
 
     def silent(self) -> tuple[Neighbour, ...]:
-        """Whom the last tick took for silent."""
+        """Neighbours that the last tick treated as silent."""
         return self.inputs().fell_silent
 
     def lands_beside_m(self) -> tuple[float, float] | None:
@@ -395,7 +395,7 @@ def test_the_grounds_word_is_as_old_as_it_is_by_the_clock_of_whoever_says_it(flo
     flown.until(FlightState.PREFLIGHT)
 
     def age_s(base: int, ahead_s: float, late_s: float = 0.0, boot_nonce: int = 11) -> float:
-        """Once a ground whose clock is so far ahead has spoken, so long ago."""
+        """Age of the ground's state, received `late_s` ago from a clock `ahead_s` ahead."""
         said_s = flown.now_s - late_s
         echo = Echo(boot_nonce, uptime_s=said_s, held_s=0.0)
         flown.say(time_base=base, time_s=said_s + ahead_s, echoes={"3": echo})
@@ -452,7 +452,7 @@ def test_another_origin_counts_on_the_ground_alone(flown: Flown) -> None:
 
 def test_what_was_known_by_one_origin_is_forgotten_with_another(flown: Flown) -> None:
     def known() -> tuple[list[int], list[int], bool]:
-        """Who fell silent, who is kept away from, and whether its landing point is taken."""
+        """Ids of silent robots and of neighbours, and whether the landing point is taken."""
         inputs = flown.inputs()
         silent, kept_away = (
             [each.robot_id for each in some] for some in (inputs.fell_silent, inputs.neighbours)

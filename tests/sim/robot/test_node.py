@@ -127,7 +127,7 @@ def test_what_it_publishes_and_logs_in_ten_seconds_of_flight() -> None:
 
 
 def test_on_the_ground_it_says_as_much_as_in_flight() -> None:
-    """So that its radio can be tried there."""
+    """The radio is then tested on the ground with the load of a flight."""
     node = a_field(1, "ready").robots[0].program.node
     assert node is not None
     sizes: list[int] = []

@@ -390,7 +390,7 @@ def test_a_robot_is_judged_beside_the_others(config: FleetConfig) -> None:
 
 def test_the_vehicle_is_asked_only_where_nothing_speaks_against_it(config: FleetConfig) -> None:
     class Silent:
-        """Nobody may be called."""
+        """Session that fails if it is used."""
 
     facts: dict[str, Any] = copy.deepcopy(dict(well(config, "r1").facts))
     facts["service"]["active"] = "inactive"
@@ -507,7 +507,7 @@ def test_a_laptop(
     config: FleetConfig, monkeypatch: pytest.MonkeyPatch,
     said: dict[str, str], name: str, verdict: str, found: str,
 ) -> None:  # fmt: skip
-    """By what its programs print; what prints "" ends with an error."""
+    """Judge a laptop by stubbed tools; one with empty output exits with an error."""
     key = config.path.with_name("KEY")
     key.touch()
 

@@ -318,7 +318,7 @@ def test_a_benchmark_that_something_else_disturbed_is_run_again(
 def test_a_signature_is_the_authoritys_and_of_this_very_release(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """By what OpenSSL says of it, which looks at no clock."""
+    """Verify with a stubbed OpenSSL, which is called without a check of time."""
     (tmp_path / "manifest.json").write_bytes(b"{}")
     (tmp_path / "signature.pem").write_text("a certificate")
     digest = hashlib.sha256(b"{}").hexdigest()

@@ -152,7 +152,7 @@ class Told:
 
 
 class Heard:
-    """What a listener of a script is told."""
+    """Listener that keeps what a script reports."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -210,7 +210,7 @@ def test_who_left_the_mission_is_started_again_if_it_holds_and_there_is_time(
     next(flying)
 
     def wanted(state: FlightState, after_s: float) -> list[Request | Until]:
-        """What it asks for once r1 is in that state, until it waits."""
+        """Requests after r1 entered a state, up to the next wait."""
         ground.now_s += after_s
         ground.tell(status(0), status(1, state=state), status(2))
         asked = [flying.send(True)]

@@ -223,7 +223,7 @@ def test_fence_that_is_off_keeps_the_heights_only() -> None:
 
 
 def at(place_m: tuple[float, float], **changes: Any) -> RobotStatus:
-    """What a robot says that stands there in the mission frame."""
+    """Status of a robot on the ground at a place in the mission frame, m."""
     here = replace(status((48.0, 11.0), 10.0), origin=SITE.origin, position_m=(*place_m, 0.0))
     return replace(here, **changes)
 

@@ -291,7 +291,7 @@ replayed         3"""
 
 
 def test_cells_say_what_is_wrong() -> None:
-    """In a row of all columns: each one's text and style."""
+    """Compare each cell's text and style in a row of all columns."""
     fence = replace(FENCE, vertices_m=((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)))
     said = status(
         1, battery=0.22, satellites=7, position_m=(5.0, 2.0, 4.5), velocity_m_s=(3.0, 4.0, 0.0),

@@ -14,7 +14,7 @@ def nothing(*_: Any) -> None:
 
 
 def program_of(keep_news: Callable[[], None] | None = None, **steps: Any) -> _Program:
-    """Whose other steps do nothing."""
+    """Make a program whose node does nothing in steps other than these."""
     names = ("control", "perception", "policy", "preflight", "status")
     node: Any = SimpleNamespace(
         **{f"{name}_step": nothing for name in names} | steps, leave=nothing, identity_problem=""
