@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from bench import BUNDLE
-from bench.report import Report, Table, Target
+from bench.result import Result, Table, Target
 from edge.core.world import random_features
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.sim.baselines import BaselineName
@@ -32,7 +32,7 @@ _FEATURES = 10
 
 def measure(
     worlds: int = 20, duration_s: float = 60.0, draws: int = 3, draws_with_loss: int = 1
-) -> Report:
+) -> Result:
     """Cost after `duration_s` over the initial cost; the policy's is a mean over clock draws.
 
     A draw is one of the robots' clock phases, jitter and lost messages.
@@ -81,7 +81,7 @@ def measure(
     counts = [f"{below_rival[name]} of {worlds}" if name != RIVAL else "" for name in names]
     rows.append((f"below {RIVAL}", *counts))
     limit = math.ceil(0.9 * worlds)
-    return Report(
+    return Result(
         "closed_loop",
         figures,
         [Table(f"Coverage cost after {duration_s:g} s over the initial cost", ("", *names), rows)],

@@ -5,7 +5,7 @@ import sys
 from time import perf_counter
 
 from bench import ROOT
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from bench.timing import quartiles, with_quartiles
 
 _LPAC = [sys.executable, "-P", "-m", "lpac.cli.main"]
@@ -18,7 +18,7 @@ _COMMANDS = {
 }
 
 
-def measure(runs: int = 10) -> Report:
+def measure(runs: int = 10) -> Result:
     """Processes of their own, in turn; one of each before, so that files come from the cache."""
     times_s: dict[str, list[float]] = {name: [] for name in _COMMANDS}
     for run in range(runs + 1):
@@ -30,7 +30,7 @@ def measure(runs: int = 10) -> Report:
                 times_s[name].append(perf_counter() - began_s)
     figures = {name: quartiles(times) for name, times in times_s.items()}
     rows = [(name, with_quartiles(figure, 3)) for name, figure in figures.items()]
-    return Report(
+    return Result(
         "command",
         figures,
         [Table("From Enter to the prompt", ("", "s"), rows)],

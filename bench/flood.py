@@ -19,7 +19,7 @@ from typing import Self
 import zenoh
 
 from bench import BUNDLE
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from edge.drivers.identity_folder import load_identity
 from edge.messages.mission import FlightState
 from edge.messages.topics import TlsFiles
@@ -52,7 +52,7 @@ class Flooded:
     holds: int
 
 
-def measure(mission_s: float = 70.0, rate_hz: int = _RATE_HZ) -> Report:
+def measure(mission_s: float = 70.0, rate_hz: int = _RATE_HZ) -> Result:
     """Four missions, of which two are flooded throughout."""
     flights = {}
     for secure in (False, True):
@@ -62,7 +62,7 @@ def measure(mission_s: float = 70.0, rate_hz: int = _RATE_HZ) -> Report:
             progress(f"flood: {name}, about two minutes")
             flights[name] = _fly(mission_s, rate, secure=secure)
     secured = flights["with keys, flooded"]
-    return Report(
+    return Result(
         "flood",
         {name: asdict(flight) for name, flight in flights.items()},
         [

@@ -21,7 +21,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from bench import BUNDLE
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from bench.stolen_key import ready_fleet
 from edge.core.aggregation import AggregatedMessage
 from edge.core.logger import show
@@ -62,7 +62,7 @@ class Heard:
 
 def measure(
     others: tuple[int, ...] = (0, 9, 99), seconds: float = 20.0, robots: int = 10
-) -> Report:
+) -> Result:
     """Each number of others in turn; they say what so many robots of a flight said."""
     heard: list[Heard] = []
     for count in others:
@@ -81,7 +81,7 @@ def measure(
                 f"{each.cpu_percent:.2f}", f"{cost_us:.0f}" if each.messages_hz else "",
             )
         )  # fmt: skip
-    return Report(
+    return Result(
         "hearing",
         {str(each.others): asdict(each) for each in heard},
         [

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import track
 
 from bench import BUNDLE
-from bench.report import Report, Table, Target
+from bench.result import Result, Table, Target
 from edge.policy.bundle import load_bundle
 from lpac.sim.experiment import fly
 from lpac.sim.scenario import Scenario
@@ -20,7 +20,7 @@ _CORES = 2
 _TIMES = 10.0
 
 
-def measure(flights: int = 200, duration_s: float = 60.0) -> Report:
+def measure(flights: int = 200, duration_s: float = 60.0) -> Result:
     """Flights of 2 to 20 robots over worlds of their own, half of them with 30 % loss."""
     scenarios = [
         Scenario(
@@ -38,7 +38,7 @@ def measure(flights: int = 200, duration_s: float = 60.0) -> Report:
             )
         )
     limit = load_bundle(BUNDLE).manifest.payload_limit
-    return Report(
+    return Result(
         "payloads",
         {"largest": max(largest), "of_each_flight": largest, "limit": limit},
         [

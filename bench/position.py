@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from rich.console import Console
 from rich.progress import track
 
-from bench.report import Report, Table, Target
+from bench.result import Result, Table, Target
 from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
 from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
 from lpac.sim.px4.errors import Errors
@@ -86,7 +86,7 @@ class _WatchedFlight(NamedTuple):
     greatest_offset_m: float
 
 
-def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
+def measure(hours: float = 24.0, flight_s: float = 600.0) -> Result:
     """Fly for so long in all, in flights of a battery's length."""
     flights = math.ceil(3600.0 * hours / flight_s)
     with ProcessPoolExecutor(_CORES, mp_context=get_context("spawn")) as processes:
@@ -124,7 +124,7 @@ def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
         Target("landings because of a position that was good", lost, 0, at_least=False),
         Target("stops per hour of flight", doubted.total() / flown_h, 0.1, at_least=False),
     ]
-    return Report("position", figures, [table], targets)
+    return Result("position", figures, [table], targets)
 
 
 def _fly(seed: int, flight_s: float) -> _WatchedFlight:

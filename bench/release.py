@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import urljoin
 
 from bench import BUNDLE, ROOT
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from lpac.fleet.image import measure as measure_image
 
 IMAGE = ROOT / "out" / "image" / "arm64"
@@ -16,7 +16,7 @@ _INDEX = "https://pypi.org/simple/torch/"
 _TIMEOUT_S = 30.0
 
 
-def measure(image: Path = IMAGE) -> Report:
+def measure(image: Path = IMAGE) -> Result:
     """The release for arm64, and torch's wheel for the same Python as the package index has it.
 
     The notes say what is missing where there is no image or no network.
@@ -24,7 +24,7 @@ def measure(image: Path = IMAGE) -> Report:
     try:
         size = measure_image(image)
     except ValueError as error:
-        return Report("release", {}, [], [], [str(error)])
+        return Result("release", {}, [], [], [str(error)])
     policy = [path.read_bytes() for path in BUNDLE.iterdir()]
     unpacked_mb = (size.unpacked_bytes + sum(map(len, policy))) / 1e6
     compressed_mb = (size.compressed_bytes + sum(len(zlib.compress(data)) for data in policy)) / 1e6
@@ -49,7 +49,7 @@ def measure(image: Path = IMAGE) -> Report:
         "torch_wheel_mb": torch_mb,
     }
     target = "compressed release over torch's wheel alone"
-    return Report(
+    return Result(
         "release",
         figures,
         [Table("A robot's release for arm64", ("", "unpacked, MB", "compressed, MB"), rows)],

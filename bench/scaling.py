@@ -12,7 +12,7 @@ from typing import Any
 from bench import BUNDLE, CHECKPOINT
 from bench.memory import memory_mb
 from bench.reference_swarm import ReferenceSwarm, is_installed
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from edge.core import F32, F64
 from edge.core.coverage import coverage_cost
 from edge.core.world import GaussianFeature
@@ -38,7 +38,7 @@ _MOST_REFERENCE_ROBOTS = 100
 Note = Callable[[float], None]
 
 
-def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Report:
+def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Result:
     """Flights in processes of their own, one at a time; `flights` are robots, seconds, repeats."""
     figures: dict[str, dict[str, Any]] = {}
     with ProcessPoolExecutor(
@@ -74,7 +74,7 @@ def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Report:
         "robots", "simulator", "world", "simulated, s", "x real time", "CPU ms per robot and s",
         f"MB per robot at {_MEMORY_AT_S:g} s", "cost J's share",
     )  # fmt: skip
-    return Report(
+    return Result(
         "scaling",
         figures,
         [Table("Simulators of points at constant density", columns, rows)],

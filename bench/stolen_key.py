@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import track
 
 from bench import BUNDLE
-from bench.report import Report, Table, Target
+from bench.result import Result, Table, Target
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
 from edge.core.logger import show
@@ -34,10 +34,10 @@ from edge.messages.topics import MESSAGE, REVOKED
 from lpac.analysis.flight import least_separation
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.station.protocol import Enable, Request, SetOrigin, Start, Takeoff
+from lpac.sim.air import GROUND
 from lpac.sim.description import ERRORS
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
-from lpac.sim.radio import GROUND
 from lpac.sim.scenario import Scenario
 
 _CORES = 2
@@ -304,7 +304,7 @@ def _harm(flown: _Flown, undisturbed: _Flown) -> Harm:
 _LIES = (Lie.NOTHING, Lie.BESIDE_ONE, Lie.BESIDE_EACH, Lie.PAYLOAD, Lie.BOTH)
 
 
-def measure(missions: int = 20, robots: int = 5, mission_s: float = 30.0) -> Report:
+def measure(missions: int = 20, robots: int = 5, mission_s: float = 30.0) -> Result:
     """Missions over worlds of their own."""
     seeds = range(missions)
     with ProcessPoolExecutor(_CORES, mp_context=get_context("spawn")) as processes:
@@ -319,7 +319,7 @@ def measure(missions: int = 20, robots: int = 5, mission_s: float = 30.0) -> Rep
     of_lies = {lie: [harm[lie] for harm, _ in results] for lie in _LIES}
     kept = [kept for _, kept in results]
     all_harms = [harm for each in of_lies.values() for harm in each]
-    return Report(
+    return Result(
         "stolen_key",
         {
             "harms": {lie.name.lower(): [asdict(h) for h in each] for lie, each in of_lies.items()},

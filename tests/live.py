@@ -8,10 +8,10 @@ from pathlib import Path
 from edge.messages.codec import decode, encode
 from edge.messages.mission import RobotStatus
 from edge.messages.topics import STATUS, Topic
+from lpac.sim.air import Subscriptions
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.live import LiveFleet
 from lpac.sim.fleet.robots import OpenLink, SimulatedRobot
-from lpac.sim.radio import Subscriptions
 from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 from tests.flown import PRECISE, QUICK, FlownRobot

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lpac.analysis import figures, style
+from lpac.analysis.examination import Examined
 from lpac.analysis.flight import LOOPS, FlightRecord
 from lpac.analysis.logs import Progress
 from lpac.analysis.page import Drawn, page
-from lpac.analysis.report import Examined
 
 PAGE = "report.html"
 SUMMARY = "report.json"

@@ -252,7 +252,7 @@ def _logged(
     logs: Path, trial: "Sequence[str] | None", world_file: Path | None, bundle: Path | None
 ) -> "dict[str, FlightRecord]":
     """The missions in the logs below a folder, by name. Raises ValueError if one has no cost."""
-    from lpac.analysis.report import Wanted, examine
+    from lpac.analysis.examination import Wanted, examine
 
     wanted = Wanted(
         trials=tuple(trial or ()), world=world_file, bundle=bundle, world_option="--world-file"
@@ -761,7 +761,7 @@ def network(
 ) -> None:
     """Table I, and throughput by number of robots: `lpac bench network` with what is installed."""
     from lpac.cli.bench import network as measure
-    from lpac.network.middleware import MIDDLEWARES
+    from lpac.middleware.kinds import MIDDLEWARES
     from lpac.paper.report import write_network
 
     folder = out or _OUT / "network"

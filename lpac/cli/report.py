@@ -39,7 +39,7 @@ def report(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Make figures and an HTML page from flight logs; and how well trials repeat."""
-    from lpac.analysis.report import Wanted, examine
+    from lpac.analysis.examination import Wanted, examine
 
     wanted = Wanted(trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle)
     with progress_of_run() as show:

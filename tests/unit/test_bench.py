@@ -10,11 +10,11 @@ from rich.console import Console
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
 from bench import closed_loop, policy, position, scaling
-from bench.report import Report
+from bench.result import Result
 from edge.policy.bundle import Bundle
 
 
-def kept(report: Report, folder: Path) -> dict[str, Any]:
+def kept(report: Result, folder: Path) -> dict[str, Any]:
     """The report as a reader of its file finds it, after it was shown."""
     report.show(Console(quiet=True))
     report.write(folder)

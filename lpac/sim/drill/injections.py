@@ -408,7 +408,7 @@ class SecondProgram:
 
 @dataclass(frozen=True, slots=True)
 class RadioIs:
-    """What becomes of all messages; see `lpac.sim.radio.Air`."""
+    """What becomes of all messages; see `lpac.sim.air.Air`."""
 
     loss: float = 0.0
     duplication: float = 0.0

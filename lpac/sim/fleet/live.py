@@ -16,6 +16,7 @@ from typing import NamedTuple, Self
 
 from edge.drivers.zenoh_link import ZenohLink
 from edge.messages.topics import ReceiveCallback
+from lpac.sim.air import Subscriptions
 from lpac.sim.fleet.layout import Settings
 from lpac.sim.fleet.robots import (
     VEHICLE_STEP_S,
@@ -24,7 +25,6 @@ from lpac.sim.fleet.robots import (
     SimulatedRobots,
 )
 from lpac.sim.ports import free_ports
-from lpac.sim.radio import Subscriptions
 from lpac.sim.scenario import Scenario
 
 # How often the clock is looked at; and how long the robots have been on when they are first heard.

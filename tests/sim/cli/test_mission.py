@@ -28,9 +28,9 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
+from lpac.sim.air import RadioLink
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
-from lpac.sim.radio import RadioLink
 from lpac.sim.scenario import Scenario
 from tests.command import called
 from tests.conftest import ROOT, SHIPPED

@@ -25,8 +25,8 @@ from edge.policy.bundle import load_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import replay
 from edge.robot.readiness import Checks
+from lpac.analysis.examination import Examined, Wanted, examine
 from lpac.analysis.flight import FlightRecord
-from lpac.analysis.report import Examined, Wanted, examine
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from lpac.ground.procedure import Procedure, Until
 from lpac.ground.script import ScriptListener, ScriptRun, load_script
@@ -39,6 +39,7 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
+from lpac.sim.air import GROUND
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.layout import ORIGIN, Settings
@@ -48,7 +49,6 @@ from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon
-from lpac.sim.radio import GROUND
 from lpac.sim.scenario import Scenario
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE

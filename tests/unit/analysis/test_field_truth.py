@@ -12,7 +12,7 @@ from edge.messages.mission import Origin
 from lpac.analysis.field_truth import read_places
 from lpac.analysis.truth import TRUTH, TrueTrack, write_truth
 from tests.ulog import HEADER, message
-from tests.unit.analysis.test_report import BEGAN_S, FIRST, IMPORTANCE, SCALE, Writer, examined
+from tests.unit.analysis.test_examination import BEGAN_S, FIRST, IMPORTANCE, SCALE, Writer, examined
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
 # How far the robots' positions are from the truth: x, y, m.

@@ -27,13 +27,13 @@ from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import load_bundle
 from lpac.analysis import figures
 from lpac.analysis.coverage import Coverage
+from lpac.analysis.examination import Examined, Wanted, examine
 from lpac.analysis.figures import overview
 from lpac.analysis.logs import read_logs
+from lpac.analysis.missions import find_missions, whole_record
 from lpac.analysis.page import Drawn, page
-from lpac.analysis.report import Examined, Wanted, examine
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.style import CURVES, SWARM, save
-from lpac.analysis.trials import find_missions, whole_record
 from lpac.analysis.write_report import write
 from lpac.cli.main import app
 from lpac.ground.record import TOPICS, GroundMetadata

@@ -14,7 +14,7 @@ from edge.policy.bundle import Bundle, BundleError, load_bundle
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, Separation
 from lpac.analysis.logs import Logs, Progress, configured_fence, read_logs
-from lpac.analysis.trials import Mission, find_missions, record_of
+from lpac.analysis.missions import Mission, find_missions, record_of
 
 _MOST_NOTES = 3  # in one line
 
