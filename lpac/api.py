@@ -25,7 +25,7 @@
 
     control = log_arrays("out/flight/robots")["robot-3"]["control"]
     control.time_s, control["position_m"]           # (T,), (T, 3): as that robot wrote it
-    [trial] = examine([Path("out/flight")]).trials  # all robots, on one clock
+    [record] = examine([Path("out/flight")]).records  # all robots, on one clock
 
 docs/api.md shows each task, one robot's steps by hand too. Names are those of the modules that they
 come from, whose docstrings say more. They change only with a new minor version, and CHANGELOG.md

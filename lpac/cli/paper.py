@@ -255,17 +255,17 @@ def _logged(
     from lpac.analysis.examination import Wanted, examine
 
     wanted = Wanted(
-        trials=tuple(trial or ()), world=world_file, bundle=bundle, world_option="--world-file"
+        missions=tuple(trial or ()), world=world_file, bundle=bundle, world_option="--world-file"
     )
     examined = examine([logs], wanted)
-    for record in examined.trials:
+    for record in examined.records:
         if not len(record.normalized):
             why = [note for note in examined.notes if note.startswith(f"{record.name}: ")]
-            others = "; or choose other missions with --trial" if len(examined.trials) > 1 else ""
+            others = "; or choose other missions with --trial" if len(examined.records) > 1 else ""
             raise ValueError("; ".join(why or [f"{record.name}: no cost is known"]) + others)
     for note in examined.notes:
         typer.echo(f"note: {note}", err=True)
-    return {record.name: record for record in examined.trials}
+    return {record.name: record for record in examined.records}
 
 
 def _beside_points(

@@ -57,7 +57,7 @@ def day(mission: FlightRecord, monkeypatch: pytest.MonkeyPatch) -> list[Wanted]:
     def examine(_: Sequence[Path], wanted: Wanted) -> Examined:
         asked.append(wanted)
         other = replace(mission, name="paper-2", coverage=None)
-        trials = [t for t in (mission, other) if not wanted.trials or t.name in wanted.trials]
+        trials = [t for t in (mission, other) if not wanted.missions or t.name in wanted.missions]
         note = f"paper-2: world 1234 is not here; give it with {wanted.world_option}"
         return Examined(tuple(trials), (note,))
 
@@ -72,7 +72,7 @@ def test_a_world_that_is_not_there_is_one_line_that_says_what_to_do(
         with pytest.raises(ValueError, match=r"^paper-2: .* with --world-file; or choose other"):
             command(logs=tmp_path, out=tmp_path / "out")
     e1(logs=tmp_path, trial=["paper-1"], world_file=Path("a.env"), out=tmp_path / "out")
-    assert (day[-1].trials, day[-1].world) == (("paper-1",), Path("a.env"))
+    assert (day[-1].missions, day[-1].world) == (("paper-1",), Path("a.env"))
 
 
 @pytest.mark.usefixtures("day")
