@@ -39,7 +39,7 @@ def measure(runs: int = 3) -> Result:
         )
         for key in keys
     }
-    units = {"first_tick_s": "first tick, s", "rss": "RSS, MB", "pss": "PSS, MB"}
+    units = {"first_tick_s": "first tick, s", "rss": "RSS, MB", "private": "private, MB"}
     rows = [
         (
             units[key],
