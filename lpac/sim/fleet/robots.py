@@ -1,7 +1,7 @@
 """Whole robots on one clock, in one process: their real nodes, and simulated vehicles.
 
-Who has them gives them their links, and lets their time pass: on a simulated clock
-(`fleet.simulated`), or as fast as real time (`fleet.live`).
+Who has them gives them their links, and lets their time pass: `fleet.simulated` on a simulated
+clock.
 """
 
 from collections.abc import Callable, Mapping, Sequence
