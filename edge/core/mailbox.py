@@ -5,13 +5,13 @@ Perception-Action-Communication Loops", section "Inter-Robot Communication". Of 
 is the receive buffer; the message to transmit is what a policy tick returns.
 """
 
-import math
 from collections import Counter
 from threading import Lock
 from typing import NamedTuple
 
 from edge.core.aggregation import AggregatedMessage
 from edge.core.arrivals import Arrivals
+from edge.core.schema import NonNegative, require
 from edge.core.shared_map import SharedMap
 from edge.core.wire import Rejection
 
@@ -69,10 +69,7 @@ class Mailbox:
     """
 
     def __init__(self, robot_id: int, max_message_age_s: float = 0.8) -> None:
-        if not 0.0 <= max_message_age_s < math.inf:
-            raise ValueError(
-                f"max_message_age_s = {max_message_age_s}: must be finite and at least 0"
-            )
+        require(NonNegative, max_message_age_s, "max_message_age_s")
         self._robot_id = robot_id
         self._max_message_age_s = max_message_age_s
         # A robot without a battery-backed clock may come back with a smaller boot epoch. Once it

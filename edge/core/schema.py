@@ -49,7 +49,24 @@ def from_mapping(cls: type[T], mapping: object, where: str) -> T:
     try:
         return msgspec.convert(mapping, cls)
     except msgspec.ValidationError as error:
-        raise ConfigError(_explain(error, cls, mapping, where)) from None
+        raise ConfigError(explain(error, cls, mapping, where)) from None
+
+
+def explain(error: msgspec.ValidationError, hint: Any, value: object, where: str) -> str:
+    """Say in one line why msgspec does not convert a value: its innermost wrong part, and why."""
+    for part in _parts(hint, value, where):
+        try:
+            msgspec.convert(part[1], part[0])
+        except msgspec.ValidationError as of_part:
+            return explain(of_part, *part)
+    if error.__cause__ is not None:
+        return f"{where}: {error.__cause__}"
+    kind, _ = _parse(hint)
+    try:
+        msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        return where + _not_of(kind, value)
+    return _fault(hint, value, where) or f"{where} = {_shown(value)}: {error}"
 
 
 class Bounded:
@@ -71,18 +88,28 @@ class Bounded:
 def check_bounds(instance: object) -> None:
     """Raise ValueError for the first field of a dataclass that is outside of its bounds."""
     cls: Any = type(instance)
-    try:
-        msgspec.convert(instance, _bounded_part(cls), from_attributes=True)
-    except msgspec.ValidationError:
-        # It is also stricter about types: numpy's numbers are none to it.
-        for name, hint in _bounded_fields(cls).items():
-            _check(hint, getattr(instance, name), name)
+    if not _fits(instance, _part(cls)):
+        for fault in _faults(instance, _bounded_fields(cls)).values():
+            raise ValueError(fault)
+
+
+def faults(instance: object, names: tuple[str, ...]) -> dict[str, str]:
+    """Those fields of a dataclass that are outside of their bounds, each with what is wrong."""
+    cls: Any = type(instance)
+    return {} if _fits(instance, _part(cls, names)) else _faults(instance, names)
+
+
+def require(hint: Any, value: object, where: str) -> None:
+    """Raise ValueError if one value is outside of the bounds of its type."""
+    fault = _fault(hint, value, where)
+    if fault is not None:
+        raise ValueError(fault)
 
 
 def bounds_of(cls: Any) -> Mapping[str, Meta]:
-    """The constraints of a dataclass's fields by name, of those that have any."""
-    metas = {name: _parse(hint)[1] for name, hint in _hints(cls).items()}
-    return {name: meta[0] for name, meta in metas.items() if meta}
+    """The constraint of each field of a dataclass that has one, else that of a list's elements."""
+    metas = {name: _bounds(hint) for name, hint in _hints(cls).items()}
+    return {name: meta for name, meta in metas.items() if meta is not None}
 
 
 def in_words(meta: Meta) -> str:
@@ -128,20 +155,44 @@ def _is_table(kind: Any) -> bool:
     return dataclasses.is_dataclass(kind)
 
 
-@functools.cache
-def _bounded_fields(cls: Any) -> dict[str, Any]:
-    return {name: hint for name, hint in _hints(cls).items() if _is_bounded(hint)}
+def _bounds(hint: Any) -> Meta | None:
+    kind, metas = _parse(hint)
+    is_list = typing.get_origin(kind) is tuple
+    return metas[0] if metas else _bounds(typing.get_args(kind)[0]) if is_list else None
 
 
 @functools.cache
-def _bounded_part(cls: Any) -> Any:
-    """A type of the bounded fields alone, by which msgspec checks an instance of the dataclass."""
-    return msgspec.defstruct(cls.__name__, list(_bounded_fields(cls).items()))
+def _bounded_fields(cls: Any) -> tuple[str, ...]:
+    return tuple(name for name, hint in _hints(cls).items() if _is_bounded(hint))
+
+
+@functools.cache
+def _part(cls: Any, names: tuple[str, ...] | None = None) -> Any:
+    """A type of those fields alone, or of all that are bounded, by which msgspec checks."""
+    chosen = _bounded_fields(cls) if names is None else names
+    return msgspec.defstruct(cls.__name__, [(name, _hints(cls)[name]) for name in chosen])
+
+
+def _fits(instance: object, part: Any) -> bool:
+    """Whether msgspec takes it; it does not take numpy's numbers, which may be within bounds."""
+    try:
+        msgspec.convert(instance, part, from_attributes=True)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _faults(instance: object, names: tuple[str, ...]) -> dict[str, str]:
+    cls: Any = type(instance)
+    hints = _hints(cls)
+    found = {name: _fault(hints[name], getattr(instance, name), name) for name in names}
+    return {name: fault for name, fault in found.items() if fault is not None}
 
 
 def _is_bounded(hint: Any) -> bool:
     kind, metas = _parse(hint)
-    return bool(metas) or any(map(_is_bounded, typing.get_args(kind)))
+    is_choice = typing.get_origin(kind) is Literal
+    return bool(metas) or is_choice or any(map(_is_bounded, typing.get_args(kind)))
 
 
 @functools.cache
@@ -179,15 +230,17 @@ def _parts(hint: Any, value: object, where: str) -> Iterator[tuple[Any, Any, str
             yield arguments[0 if repeated else i], each, f"{where}[{i}]"
 
 
-def _check(hint: Any, value: Any, where: str) -> None:
+def _fault(hint: Any, value: Any, where: str) -> str | None:
+    """What is outside of its bounds in a value of the right type, as one line."""
     if value is None:
-        return
-    _, metas = _parse(hint)
+        return None
+    kind, metas = _parse(hint)
     for meta in metas:
         if not _holds(meta, value):
-            raise ValueError(f"{where} = {_shown(value)}: must be {in_words(meta)}")
-    for part in _parts(hint, value, where):
-        _check(*part)
+            return f"{where} = {_shown(value)}: must be {in_words(meta)}"
+    if typing.get_origin(kind) is Literal and value not in typing.get_args(kind):
+        return where + _not_of(kind, value)
+    return next(filter(None, (_fault(*part) for part in _parts(hint, value, where))), None)
 
 
 def _holds(meta: Meta, value: Any) -> bool:
@@ -212,24 +265,6 @@ def _require_known_keys(hint: Any, value: object, where: str) -> None:
                 raise ConfigError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")
     for part in _parts(hint, value, where):
         _require_known_keys(*part)
-
-
-def _explain(error: msgspec.ValidationError, hint: Any, value: object, where: str) -> str:
-    """Say in one line why a value does not convert: where, the innermost part, what is allowed."""
-    for part in _parts(hint, value, where):
-        try:
-            msgspec.convert(part[1], part[0])
-        except msgspec.ValidationError as of_part:
-            return _explain(of_part, *part)
-    if error.__cause__ is not None:
-        return f"{where}: {error.__cause__}"
-    kind, metas = _parse(hint)
-    try:
-        msgspec.convert(value, kind)
-    except msgspec.ValidationError:
-        return where + _not_of(kind, value)
-    words = [in_words(meta) for meta in metas if not _holds(meta, value)]
-    return f"{where} = {_shown(value)}: must be {' and '.join(words) or error}"
 
 
 def _not_of(kind: Any, value: object) -> str:

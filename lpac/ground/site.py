@@ -17,10 +17,10 @@ from geographiclib.geodesic import Geodesic
 
 from edge.core.fence import Fence
 from edge.core.file_errors import in_words
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.schema import ConfigError, from_mapping, require
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.messages.mission import GroundState, Origin, Place, RobotStatus
-from edge.robot.config import require_name
+from edge.robot.config import PlainName
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 
 # Beyond these a robot does not stand still, or does not know where it is.
@@ -427,7 +427,7 @@ class Sites:
     def path(self, name: str) -> Path:
         """The file of a site."""
         try:
-            require_name("site ", name)
+            require(PlainName, name, "site")
         except ValueError as error:
             raise ConfigError(str(error)) from None
         return self.folder / f"{name}.toml"

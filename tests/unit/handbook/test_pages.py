@@ -132,7 +132,7 @@ def test_every_key_is_in_the_reference(
 
 def test_keys_have_their_defaults_and_kinds() -> None:
     robot = configuration.robot()
-    assert "| `policy_hz` | number | `2.5` |" in robot
+    assert "| `policy_hz` | number (from 0.1 to 100) | `2.5` |" in robot
     assert '| `rc` | `"pilot"` or `"none"` | must be given |' in robot
     assert '| `type` | text | `"px4"` |' in robot
     assert "\n### [[data.worlds]]\n" in configuration.training()
@@ -160,7 +160,7 @@ def test_interfaces_tell_calls_as_the_source_has_them() -> None:
         "TOLERANCE = 1e-5",
     ):
         assert f"```python\n{said}\n```" in text, said
-    assert "# Importance of what has not been seen yet.\nunknown_importance: float" in text
+    assert "# Importance of what has not been seen yet.\nunknown_importance: NonNegative" in text
     for name in re.findall(r"`([A-Z]\w+(?:Driver|Family))`", _GUIDE.read_text()):
         assert f"### {name}\n" in text, name
     for module, name in interfaces.names():

@@ -40,7 +40,7 @@ from tests.training import SMALL, read
         ('"small"', '"a/b"', "export: name = 'a/b': must be letters, digits"),
         ("image_size = 8", "depth = 8", "network: unknown key 'depth'; known are channels, "),
         ("sensor_size = 32", "sensor_size = 31", "perception: sensor_size = 31: must be positive"),
-        ("max_speed = 5.0", "max_speed = 0.0", "training: max_speed = 0.0: must be positive"),
+        ("max_speed = 5.0", "max_speed = 0.0", "training: max_speed = 0.0: must be above 0"),
         ("[fit]", "[fit", "small.toml: is not TOML"),
     ],
 )
