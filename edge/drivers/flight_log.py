@@ -199,6 +199,11 @@ class FlightLog:
         """Whether messages are written. Any thread may ask."""
         return self._segment is not None
 
+    @property
+    def dropped(self) -> int:
+        """How many messages were recorded faster than they were written, or could not be."""
+        return self._dropped
+
     def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
         """Keep one message; nobody may change it, or the arrays in it, afterwards."""
         if self._closed:
