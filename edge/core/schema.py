@@ -28,8 +28,9 @@ Finite = Annotated[float, Meta(ge=-MAX_FLOAT, le=MAX_FLOAT)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=MAX_FLOAT)]
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_FLOAT)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+AtLeastZero = Annotated[int, Meta(ge=0)]
 AtLeastOne = Annotated[int, Meta(ge=1)]
-Point = Annotated[tuple[Finite, ...], Meta(min_length=2, max_length=2, description="[x, y]")]
+PointXY = Annotated[tuple[Finite, ...], Meta(min_length=2, max_length=2, description="[x, y]")]
 
 
 class ConfigError(ValueError):

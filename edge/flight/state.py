@@ -18,7 +18,7 @@ from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
-from edge.core.schema import Bounded, Point, Positive
+from edge.core.schema import Bounded, PointXY, Positive
 from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
 from edge.flight.lift import Lift
@@ -75,7 +75,7 @@ class FlightParameters(Bounded):
     """
 
     slot: SlotNumber
-    landing_point_m: Point
+    landing_point_m: PointXY
     base_height_m: Positive = 5.0
     slot_spacing_m: Positive = 4.5
     min_separation_m: Positive = 1.5

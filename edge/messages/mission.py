@@ -50,6 +50,7 @@ from edge.messages.codes import FailedCheck, Reason, ReasonCode, Refusal
 # Of what is said now. A message of another version is taken as far as it can be; see the codec.
 VERSION = 3
 ORDER_LIFETIME_S = 10.0
+Heading = Annotated[float, Meta(ge=0.0, lt=360.0)]
 SlotNumber = Annotated[int, Meta(ge=0, le=1000)]
 # A mission starts within this distance of the robot's own height.
 AT_SLOT_M = 1.0
@@ -104,7 +105,7 @@ class Origin(Bounded):
 
     latitude_deg: Latitude
     longitude_deg: Longitude
-    heading_deg: Annotated[float, Meta(ge=0.0, lt=360.0)]
+    heading_deg: Heading
 
     def frame(self) -> MissionFrame:
         """The mission frame itself."""

@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from edge.core.address import host_and_port, ipv4, is_loopback_endpoint, require_host, same_host
 from edge.core.file_errors import in_words
-from edge.core.schema import Bounded, ConfigError, Point, from_mapping
+from edge.core.schema import Bounded, ConfigError, PointXY, from_mapping
 from edge.flight.margins import Margin, places_apart
 from edge.messages.bounds import RobotId
 from edge.messages.mission import SlotNumber
@@ -139,8 +139,8 @@ class Slot(Bounded):
     """
 
     height: SlotNumber
-    pad_m: Point
-    landing_point_m: Point
+    pad_m: PointXY
+    landing_point_m: PointXY
     robot: str | None = None
 
 

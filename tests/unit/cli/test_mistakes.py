@@ -48,7 +48,10 @@ from tests.conftest import SHIPPED
             "sensor: type = 'foo': is not installed here",
         ),
         (["paper", "all", "--namespaces", "a,b"], "2 given, and 10 robots need one each"),
-        (["sim", "--away", "3@20-10"], "failure of robot 3: from_s = 20.0, until_s = 10.0: must"),
+        (
+            ["sim", "--away", "3@20-10"],
+            "failure of robot 3: until_s = 10.0: must be after from_s = 20.0",
+        ),
         (
             ["sim", "--lag", "1", "--vehicle", "mavlink"],
             "--lag does nothing with --vehicle mavlink",

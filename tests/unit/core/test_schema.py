@@ -18,7 +18,7 @@ from edge.core.schema import (
     ConfigError,
     Finite,
     NonNegative,
-    Point,
+    PointXY,
     Positive,
     Share,
     bounds_of,
@@ -52,7 +52,7 @@ class Whole(Bounded):
     name: Annotated[
         str, Meta(pattern=r"\A[a-z]{1,8}\Z", description="1 to 8 letters, such as 'abc'")
     ] = "abc"
-    place_m: Point = (0.0, 0.0)
+    place_m: PointXY = (0.0, 0.0)
     pair: tuple[Positive, Share] = (1.0, 0.5)
     periods_s: Annotated[tuple[Positive, ...], Meta(min_length=1)] = (1.0,)
     colour: Colour = Colour.RED

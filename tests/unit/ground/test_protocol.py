@@ -142,7 +142,7 @@ def test_json_is_a_request_or_a_clear_refusal(name: str, fields: object) -> None
 @pytest.mark.parametrize(
     ("line", "why"),
     [
-        (b'{"takeoff": {"interval_s": -1}}', "Takeoff: interval_s = -1.0: must be from 0 to 600"),
+        (b'{"takeoff": {"interval_s": -1}}', "Takeoff: interval_s = -1: must be from 0 to 600"),
         (b'{"takeoff": {"interval_s": NaN}}', "JSON is malformed"),
         (b'{"origin": {"origin": {"latitude_deg": 1, "longitude_deg": 2, "heading_deg": 360}}}',
          "heading_deg = 360: must be at least 0 and below 360"),

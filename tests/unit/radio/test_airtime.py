@@ -347,7 +347,7 @@ def test_impossible_traffic_is_named(name: str, value: Any, allowed: str) -> Non
 
 def test_impossible_questions_are_named() -> None:
     unknown: Any = "pigeon"
-    with pytest.raises(ValueError, match=r"^transport = 'pigeon': must be one of mesh, router"):
+    with pytest.raises(ValueError, match=r"^transport = 'pigeon': allowed are 'mesh', 'router'"):
         airtime(unknown, WIFI, TEN)
     with pytest.raises(ValueError, match=r"^guests = 3: must be 0 in a mesh"):
         airtime("mesh", WIFI, replace(TEN, guests=3))
