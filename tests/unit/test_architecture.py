@@ -53,9 +53,6 @@ ALLOWED = {
     "lpac.sim.ports": set(),
     "lpac.sim.programs": set(),
     "lpac.radio": {"edge.core", "edge.messages", "edge.identity"},
-    "lpac.radio.figures": {
-        "edge.core", "edge.messages", "edge.identity", "lpac.analysis", "lpac.radio",
-    },
     "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
     "lpac.extras": set(),
     "lpac.middleware": {
@@ -92,7 +89,6 @@ ONLY_IN = {
         "lpac/train/",
         "lpac/ablate/",
         "lpac/paper/",
-        "lpac/radio/figures.py",
         "lpac/radio/heat_map.py",
         "lpac/middleware/figures.py",
     },

@@ -429,8 +429,8 @@ def test_it_asks_for_what_the_programs_links_took_of_emulated_air(
 
 def test_the_docs_tables_are_the_models() -> None:
     pytest.importorskip("matplotlib")
-    from lpac.radio.figures import tables  # noqa: PLC0415
+    from handbook.scaling import tables  # noqa: PLC0415
 
     text = (ROOT / "docs" / "scaling.md").read_text()
     for name, table in tables().items():
-        assert table in text, f"{name}: python -m lpac.radio.figures prints it anew"
+        assert table in text, f"{name}: python -m handbook.scaling prints it anew"
