@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -62,7 +62,7 @@ def explain(error: msgspec.ValidationError, hint: Any, value: object, where: str
             return explain(of_part, *part)
     if error.__cause__ is not None:
         return f"{where}: {error.__cause__}"
-    kind, _ = _parse(hint)
+    kind = _parse(hint).kind
     try:
         msgspec.convert(value, kind)
     except msgspec.ValidationError:
@@ -157,7 +157,7 @@ def _is_table(kind: Any) -> bool:
 
 
 def _bounds(hint: Any) -> Meta | None:
-    kind, metas = _parse(hint)
+    kind, metas, _ = _parse(hint)
     is_list = typing.get_origin(kind) is tuple
     return metas[0] if metas else _bounds(typing.get_args(kind)[0]) if is_list else None
 
@@ -191,15 +191,23 @@ def _faults(instance: object, names: tuple[str, ...]) -> dict[str, str]:
 
 
 def _is_bounded(hint: Any) -> bool:
-    kind, metas = _parse(hint)
+    kind, metas, _ = _parse(hint)
     is_choice = typing.get_origin(kind) is Literal
     return bool(metas) or is_choice or any(map(_is_bounded, typing.get_args(kind)))
 
 
+class _Parsed(NamedTuple):
+    """A field's type without None and constraints, its constraints, whether it may be None."""
+
+    kind: Any
+    metas: tuple[Meta, ...]
+    optional: bool
+
+
 @functools.cache
-def _parse(hint: Any) -> tuple[Any, tuple[Meta, ...]]:
-    """The type without None and constraints, and the constraints."""
+def _parse(hint: Any) -> _Parsed:
     metas: tuple[Meta, ...] = ()
+    optional = False
     while True:
         origin, arguments = typing.get_origin(hint), typing.get_args(hint)
         if origin is Annotated:
@@ -207,14 +215,14 @@ def _parse(hint: Any) -> tuple[Any, tuple[Meta, ...]]:
             hint = hint.__origin__
         elif origin in (types.UnionType, typing.Union) and type(None) in arguments:
             others = (each for each in arguments if each is not type(None))
-            hint = functools.reduce(operator.or_, others)
+            hint, optional = functools.reduce(operator.or_, others), True
         else:
-            return hint, metas
+            return _Parsed(hint, metas, optional)
 
 
 def _parts(hint: Any, value: object, where: str) -> Iterator[tuple[Any, Any, str]]:
     """What of a table or list has a type of its own: the type, the value, and where it is."""
-    kind, _ = _parse(hint)
+    kind = _parse(hint).kind
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if isinstance(value, Mapping):
         if _is_table(kind):
@@ -233,9 +241,9 @@ def _parts(hint: Any, value: object, where: str) -> Iterator[tuple[Any, Any, str
 
 def _fault(hint: Any, value: Any, where: str) -> str | None:
     """What is outside of its bounds in a value of the right type, as one line."""
-    if value is None:
+    kind, metas, optional = _parse(hint)
+    if value is None and optional:
         return None
-    kind, metas = _parse(hint)
     for meta in metas:
         if not _holds(meta, value):
             return f"{where} = {_shown(value)}: must be {in_words(meta)}"
@@ -258,7 +266,7 @@ def _holds(meta: Meta, value: Any) -> bool:
 
 
 def _require_known_keys(hint: Any, value: object, where: str) -> None:
-    kind, _ = _parse(hint)
+    kind = _parse(hint).kind
     if _is_table(kind) and isinstance(value, Mapping):
         known = _hints(kind)
         for key in value:

@@ -21,6 +21,7 @@ from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.schema import Bounded, PointXY, Positive
 from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
+from edge.flight.failsafe import CommandTimeout
 from edge.flight.lift import Lift
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
@@ -81,7 +82,7 @@ class FlightParameters(Bounded):
     min_separation_m: Positive = 1.5
     battery_low: _BatteryShare = 0.25
     battery_critical: _BatteryShare = 0.15
-    command_timeout_s: Positive = 0.5
+    command_timeout_s: CommandTimeout = 0.5
     ground_timeout_s: Positive = 3.0
     ground_lost_land_s: Positive = 10.0
     takeoff_timeout_s: Positive = 15.0
