@@ -18,9 +18,15 @@ BENCHES = (
     "scaling",
     "simulated",
     "closed_loop",
+    "payloads",
     "usual",
+    "stolen_key",
+    "flood",
     "hearing",
     "loops",
+    "release",
+    "position",
+    "command",
 )
 
 

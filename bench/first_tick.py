@@ -1,10 +1,9 @@
 """What a robot's policy process tells `footprint` about itself, ours and torch's alike."""
 
 import json
-import os
 from collections.abc import Callable
 
-from bench.usage import usage
+from bench.memory import memory_mb
 
 TICKED = "ticked\n"
 TICKS = 20
@@ -21,5 +20,4 @@ def run(tick: Callable[[], object]) -> None:
     print(TICKED, end="", flush=True)
     for _ in range(TICKS - 1):
         tick()
-    taken = usage(os.getpid())
-    print(json.dumps({"rss": taken.resident_mb, "private": taken.private_mb}), flush=True)
+    print(json.dumps(memory_mb()), flush=True)

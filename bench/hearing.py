@@ -21,7 +21,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from bench import BUNDLE
-from bench.result import Result, Table, Target, progress
+from bench.report import Report, Table, Target, progress
+from bench.stolen_key import ready_fleet
 from edge.core.aggregation import AggregatedMessage
 from edge.core.logger import show
 from edge.core.wire import PayloadType, decode, encode, payload_type_of
@@ -35,17 +36,15 @@ from edge.identity.news import MessageNumber
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon
 from edge.messages.topics import MESSAGE, Group, Link, Topic
 from edge.policy.bundle import load_bundle
-from lpac.ground.station.protocol import Enable, SetOrigin, Start, Takeoff
-from lpac.sim.fleet.layout import ORIGIN
+from lpac.ground.station.protocol import Start, Takeoff
 from lpac.sim.fleet.members import SimulatedMembers
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.ports import free_ports
-from lpac.sim.scenario import Scenario
 
 _FLEET, _SEED = "simulated", 1
 _KEY = b"h" * 32
-# After each command robots of the simulated flight are ready for the next, and have seen something
-# after the last; and how long until the others know that somebody is there, s.
+# By when robots of the simulated flight have seen something, and how long until the others know
+# that somebody is there, s.
 _FLOWN_S, _WARM_UP_S = 15.0, 3.0
 # Programs that began after those of the flight.
 _START = int(1e3 * (EPOCH_S + 3600.0))
@@ -63,7 +62,7 @@ class Heard:
 
 def measure(
     others: tuple[int, ...] = (0, 9, 99), seconds: float = 20.0, robots: int = 10
-) -> Result:
+) -> Report:
     """Each number of others in turn; they say what so many robots of a flight said."""
     heard: list[Heard] = []
     for count in others:
@@ -82,7 +81,7 @@ def measure(
                 f"{each.cpu_percent:.2f}", f"{cost_us:.0f}" if each.messages_hz else "",
             )
         )  # fmt: skip
-    return Result(
+    return Report(
         "hearing",
         {str(each.others): asdict(each) for each in heard},
         [
@@ -107,9 +106,7 @@ def _hear(others: int, seconds: float, robots: int) -> Heard:
     port, zenoh_port = free_ports(2)
     group = Group("239.255.76.90", port, "127.0.0.1", (_KEY,), is_secret=True)
     with tempfile.TemporaryDirectory() as folder:
-        fleet = SimulatedFleet(
-            Scenario(robots=robots, seed=_SEED, secure=True), Path(folder), BUNDLE
-        )
+        fleet = ready_fleet(robots, _SEED, Path(folder))
         said = _messages_of(fleet)
         node = fleet.robots[0].node
         assert node is not None
@@ -151,7 +148,7 @@ def _messages_of(fleet: SimulatedFleet) -> "list[_Said]":
         body = data[BEACON_BYTES:]
         message = decode(
             body,
-            bundle_id=policy.bundle_id, frame_id=None, own_robot_id=listener,
+            bundle_id=policy.bundle_id, frame_id=None,
             message_size=policy.message_size, shared_side=perception.shared_map_side,
         )  # fmt: skip
         if isinstance(message, AggregatedMessage):
@@ -162,12 +159,11 @@ def _messages_of(fleet: SimulatedFleet) -> "list[_Said]":
         Role.ROBOT, "listener", listener, _START, fleet.schedule.monotonic_s
     )
     fleet.radio.link(listener, guard.subscriptions({MESSAGE: hear}))
-    fleet.schedule.run_until(_FLOWN_S)
-    for request in (SetOrigin(ORIGIN), Enable(), Takeoff(), Start()):
+    for request in (Takeoff(), Start()):
         report = fleet.ground.command(request)
         if not report.done:
             raise RuntimeError(f"the flight did not go as planned: {report}")
-        fleet.schedule.run_until(fleet.ground.now_s + _FLOWN_S)
+    fleet.schedule.run_until(fleet.ground.now_s + _FLOWN_S)
     return said[-listener:]
 
 

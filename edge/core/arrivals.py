@@ -35,8 +35,10 @@ class Arrivals(NamedTuple):
     @property
     def counts(self) -> tuple[int, ...]:
         """`sent`, `undated` and `by_age`, but for zeros at the end: short, for messages."""
-        numbers = (self.sent, self.undated, *self.by_age)
-        return numbers[: max((n for n, number in enumerate(numbers, 1) if number), default=0)]
+        numbers = [self.sent, self.undated, *self.by_age]
+        while numbers and not numbers[-1]:
+            numbers.pop()
+        return tuple(numbers)
 
     @property
     def arrived(self) -> int:
@@ -54,9 +56,9 @@ class Arrivals(NamedTuple):
         """With one that came so old, and `sent` more that were said."""
         if age_s is None:
             return self._replace(sent=self.sent + sent, undated=self.undated + 1)
-        at = bisect_right(AGE_EDGES_S, age_s)
-        by_age = tuple(count + (n == at) for n, count in enumerate(self.by_age))
-        return self._replace(sent=self.sent + sent, by_age=by_age)
+        at, by_age = bisect_right(AGE_EDGES_S, age_s), list(self.by_age)
+        by_age[at] += 1
+        return Arrivals(self.sent + sent, self.undated, tuple(by_age))
 
     def older_than(self, edge_s: float) -> int:
         """How many came as old as one of `AGE_EDGES_S`, or older."""

@@ -5,13 +5,13 @@ Perception-Action-Communication Loops", section "Inter-Robot Communication". Of 
 is the receive buffer; the message to transmit is what a policy tick returns.
 """
 
+import math
 from collections import Counter
 from threading import Lock
 from typing import NamedTuple
 
 from edge.core.aggregation import AggregatedMessage
 from edge.core.arrivals import Arrivals
-from edge.core.schema import NonNegative, require
 from edge.core.shared_map import SharedMap
 from edge.core.wire import Rejection
 
@@ -69,9 +69,14 @@ class Mailbox:
     """
 
     def __init__(self, robot_id: int, max_message_age_s: float = 0.8) -> None:
-        require(NonNegative, max_message_age_s, "max_message_age_s")
+        if not 0.0 <= max_message_age_s < math.inf:
+            raise ValueError(
+                f"max_message_age_s = {max_message_age_s}: must be finite and at least 0"
+            )
         self._robot_id = robot_id
         self._max_message_age_s = max_message_age_s
+        # By the paper's rule, at any age.
+        self._kept_s = max_message_age_s or math.inf
         # A robot without a battery-backed clock may come back with a smaller boot epoch. Once it
         # was silent for longer than a message can be in transit, nothing of an earlier start can
         # still arrive, so whatever does is of a new one.
@@ -113,23 +118,24 @@ class Mailbox:
             if self._max_message_age_s == 0.0:
                 self._handed_out, self._received = self._received, {}
             received = sorted(handed_out.items())
-        return tuple(entry.message for _, entry in received if self._is_fresh(entry.born_s, now_s))
+        return tuple(entry.message for _, entry in received if now_s - entry.born_s < self._kept_s)
 
     def neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
         """Who is near and where, by robot id; takes nothing away."""
         with self._lock:
             received = sorted((self._handed_out | self._received).items())
+        kept_s = self._kept_s
         return tuple(
             Neighbour(
                 robot_id,
-                entry.message.position_m,
-                entry.message.velocity_m_s,
-                max(now_s - entry.born_s, 0.0),
-                entry.message.trial,
-                entry.message.shared,
+                message.position_m,
+                message.velocity_m_s,
+                max(now_s - born_s, 0.0),
+                message.trial,
+                message.shared,
             )
-            for robot_id, entry in received
-            if self._is_fresh(entry.born_s, now_s)
+            for robot_id, (message, born_s) in received
+            if now_s - born_s < kept_s
         )
 
     def reject(self, reason: Rejection) -> None:
@@ -178,9 +184,6 @@ class Mailbox:
 
     def _silent(self, heard: _LastHeard, now_s: float) -> bool:
         return now_s - heard.at_s > self._restart_silence_s
-
-    def _is_fresh(self, born_s: float, now_s: float) -> bool:
-        return self._max_message_age_s == 0.0 or now_s - born_s < self._max_message_age_s
 
     def _rejection(
         self, message: AggregatedMessage, now_s: float, age_s: float | None

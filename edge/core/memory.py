@@ -138,5 +138,6 @@ class RobotMemory:
         if self._cells:
             told = self._cells.importance(corner, self._local.shape[0])
             np.copyto(self._local, told, where=np.isnan(self._local))
-            np.copyto(self._local, self._unseen, where=np.isnan(self._local))
+            if not math.isnan(self._unseen):
+                np.copyto(self._local, self._unseen, where=np.isnan(self._local))
         return self._local

@@ -229,7 +229,6 @@ def decode(
     *,
     bundle_id: bytes,
     frame_id: int | None,
-    own_robot_id: int,
     message_size: int,
     payload_limit: float | None = None,
     shared_side: int = 0,
@@ -252,8 +251,6 @@ def decode(
         return wrong
     if header.bundle_id != bundle_id[:_BUNDLE_ID_SIZE]:
         return Rejection.OTHER_BUNDLE
-    if header.robot_id == own_robot_id:
-        return Rejection.OWN
     if header.payload_length != message_size:
         return Rejection.PAYLOAD_LENGTH
     if header.kind & _COMPRESSED:

@@ -23,13 +23,14 @@ def reason_if(condition: bool, reason: str) -> str | None:
 
 
 def failsafe(t: Tick) -> str | None:
-    return reason_if(t.failsafe_acts, f"the autopilot's own failsafe acts: {t.mode}")
+    return f"the autopilot's own failsafe acts: {t.mode}" if t.failsafe_acts else None
 
 
 def hovers_alone(t: Tick) -> str | None:
+    if t.flight.alone_since_s is None:
+        return None
     limit_s = t.robot.parameters.hover_land_s
-    text = f"hovers, and lands {limit_s:g} s after it began to, if nobody orders or holds it"
-    return reason_if(t.flight.alone_since_s is not None, text)
+    return f"hovers, and lands {limit_s:g} s after it began to, if nobody orders or holds it"
 
 
 def remote_control_lost(t: Tick) -> str | None:
@@ -42,13 +43,13 @@ def remote_control_lost(t: Tick) -> str | None:
 
 
 def position_lost(t: Tick) -> str | None:
-    lost = t.inputs.position.quality is PositionQuality.LOST
-    return reason_if(lost, f"position lost: {t.inputs.position.text}")
+    position = t.inputs.position
+    return f"position lost: {position.text}" if position.quality is PositionQuality.LOST else None
 
 
 def position_doubtful(t: Tick) -> str | None:
-    doubtful = t.inputs.position.quality is PositionQuality.DOUBTFUL
-    return reason_if(doubtful, f"position doubtful: {t.inputs.position.text}")
+    position, doubtful = t.inputs.position, PositionQuality.DOUBTFUL
+    return f"position doubtful: {position.text}" if position.quality is doubtful else None
 
 
 def off_height(t: Tick) -> str | None:
@@ -110,7 +111,7 @@ def px4_changed(t: Tick) -> str | None:
 
 def link_loses(t: Tick) -> str | None:
     share = t.inputs.vehicle.link_lost
-    return reason_if(share > 0.0, f"{share:.0%} of the autopilot's messages are lost on the way")
+    return f"{share:.0%} of the autopilot's messages are lost on the way" if share > 0.0 else None
 
 
 def link_twice(t: Tick) -> str | None:
@@ -152,13 +153,14 @@ _LINK_ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
     ReasonCode.LINK_LOSES: link_loses,
     ReasonCode.LINK_TWICE: link_twice,
 }
+_IN_FLIGHT = {**ALARMS, **_LINK_ALARMS}
 
 
 def alarms(t: Tick) -> tuple[Reason, ...]:
     """What the operator must see, the gravest first, each thing once."""
     found = [t.flight.reason] if t.flight.alarming else []
     in_flight = t.flight.state in (*AIRBORNE, FlightState.PILOT)
-    conditions = {**ALARMS, **_LINK_ALARMS} if in_flight else _LINK_ALARMS
+    conditions = _IN_FLIGHT if in_flight else _LINK_ALARMS
     found += [
         Reason(code, text) for code, condition in conditions.items() if (text := condition(t))
     ]

@@ -21,7 +21,7 @@ import numpy as np
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
-from edge.core.schema import Bounded, NonNegative, Positive
+from edge.core.vehicle import Vector
 from edge.flight.silence import SilenceLimits, highest_still_m, nearest_on_way_m, strays_m
 
 _ABSURD = 1e6
@@ -36,7 +36,7 @@ _PASSING_M_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class MotionLimits(Bounded):
+class MotionLimits:
     """How fast the robot may move, and how its vehicle answers.
 
     `max_acceleration_m_s2` is at most 0.7 of what the vehicle reaches: it may have to brake and to
@@ -46,10 +46,18 @@ class MotionLimits(Bounded):
     Raises ValueError if one is not finite and above 0 (the lag: at least 0).
     """
 
-    max_speed_m_s: Positive
-    max_climb_m_s: Positive
-    max_acceleration_m_s2: Positive
-    lag_s: NonNegative
+    max_speed_m_s: float
+    max_climb_m_s: float
+    max_acceleration_m_s2: float
+    lag_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("max_speed_m_s", "max_climb_m_s", "max_acceleration_m_s2"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} = {value}: must be finite and above 0")
+        if not 0.0 <= self.lag_s < math.inf:
+            raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
 
 
 class SeparationLimits(NamedTuple):
@@ -112,7 +120,7 @@ def limit_speed(velocity: F64, max_speed: float) -> F64:
     A velocity that is not finite becomes 0.
     """
     speed = float(np.hypot(*velocity))
-    if not np.isfinite(speed):
+    if not math.isfinite(speed):
         return np.zeros(2)
     return velocity if speed <= max_speed else velocity * (max_speed / speed)
 
@@ -387,12 +395,11 @@ def _speed_to(slack_m: float, speed_m_s: float, limits: MotionLimits) -> float:
     return -_speed_towards(-slack_m, -speed_m_s, limits)
 
 
-def _extrapolated(neighbour: Neighbour) -> list[float]:
-    """Where it is now, (3,), if it has flown on as it did."""
-    return [
-        place_m + speed_m_s * neighbour.age_s
-        for place_m, speed_m_s in zip(neighbour.position_m, neighbour.velocity_m_s, strict=True)
-    ]
+def _extrapolated(neighbour: Neighbour) -> Vector:
+    """Where it is now, if it has flown on as it did."""
+    (x_m, y_m, z_m), age_s = neighbour.position_m, neighbour.age_s
+    x_m_s, y_m_s, z_m_s = neighbour.velocity_m_s
+    return x_m + x_m_s * age_s, y_m + y_m_s * age_s, z_m + z_m_s * age_s
 
 
 def _is_known(neighbour: Neighbour) -> bool:
@@ -451,4 +458,8 @@ def _keep_height(
 
 
 def _plausible(*vectors: Iterable[float]) -> bool:
-    return all(abs(number) < _ABSURD for vector in vectors for number in vector)
+    for vector in vectors:
+        for number in vector:
+            if not -_ABSURD < number < _ABSURD:
+                return False
+    return True

@@ -92,7 +92,12 @@ def _look(t: Tick) -> FlightMemory:
         flight = _with(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
     if not is_silent(flight, now_s) and (flight.reached or flight.state not in STEERED):
         flight = _with(flight, silent_until_s=-math.inf)
-    flight = _with(flight, lift=_lift(t))
+    flight = _with(
+        flight,
+        lift=_lift(t),
+        ground_at_s=now_s if t.ground_heard else flight.ground_at_s,
+        remote_control_at_s=now_s if vehicle.remote_control else flight.remote_control_at_s,
+    )
     landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
     down = flight.state is _S.LAND and in_air(flight, vehicle, now_s) is False
     flight = _with(flight, landed_since_s=landed_since_s if down else None)
@@ -107,10 +112,6 @@ def _look(t: Tick) -> FlightMemory:
         looked = vehicle.heartbeat_at_s > flight.since_s + STALE_TELEMETRY_S
         if flight.state in ON_GROUND and looked:
             flight = _with(flight, armed_by="")
-    if vehicle.remote_control:
-        flight = replace(flight, remote_control_at_s=now_s)
-    if t.ground_heard:
-        flight = replace(flight, ground_at_s=now_s)
     flight = _with(flight, alone_since_s=_alone_since_s(t))
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))
@@ -158,8 +159,9 @@ def _as_needed(state: FlightState, vehicle: VehicleState) -> bool:
 
 
 def _first_row(tick: Tick, ordered: OrderKind | None) -> tuple[Transition | None, str]:
+    state, orders = tick.flight.state, (None, ordered)
     for row in TRANSITIONS:
-        if tick.flight.state in row.sources and row.order in (None, ordered):
+        if state in row.sources and row.order in orders:
             reason = row.why(tick)
             if reason is not None:
                 return row, reason

@@ -31,6 +31,7 @@ Little-endian:
 What is out of a field's range is said as the field's greatest or least.
 """
 
+import functools
 import math
 import struct
 import zlib
@@ -124,7 +125,12 @@ def decode_beacon(data: bytes | memoryview) -> Beacon:
     """The beacon at the start of `data`. Raises MessageError."""
     if len(data) < BEACON_BYTES:
         raise MessageError(f"Beacon: {len(data)} bytes: must be {BEACON_BYTES}")
-    body = bytes(data[:BEACON_BYTES])
+    return _decoded(bytes(data[:BEACON_BYTES]))
+
+
+# The robots of one process, as in a simulator, hear the same bytes within a moment.
+@functools.lru_cache(maxsize=8)
+def _decoded(body: bytes) -> Beacon:
     if not body.startswith(_HEAD):
         raise MessageError("Beacon: of another version, or none")
     (

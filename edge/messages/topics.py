@@ -6,15 +6,13 @@ who sends what, sizes and priorities from here, and drops what is larger.
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
 Sender = Literal["robot", "ground"]
 Priority = Literal["now", "later"]
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
+class Topic(NamedTuple):
     """One kind of message.
 
     `content` names what its bytes are, `rate_hz` is how often one sender says it (a state less

@@ -16,7 +16,7 @@ from edge.flight.landing import Point, may_stand, place_to_land, standing_robots
 from edge.flight.lift import OFF_HEIGHT_M
 from edge.flight.record import Given, made
 from edge.flight.safety import Closest, nearest
-from edge.flight.silence import highest_still_m, last_word
+from edge.flight.silence import SilenceLimits, highest_still_m, last_word
 from edge.flight.state import (
     FlightInputs,
     FlightMemory,
@@ -143,10 +143,9 @@ class FlightControl:
         # Another thread replaces them meanwhile.
         peers = self.peers
         heard = self._neighbours(peers, now_s)
-        silent, separation = self._silent(peers, heard, now_s), self.assignment.robot.separation
-        self.fell_silent = tuple(
-            each for each in silent if highest_still_m(each, separation.silence) > 0.0
-        )
+        silence = self.assignment.robot.separation.silence
+        silent = self._silent(peers, heard, silence, now_s)
+        self.fell_silent = tuple(each for each in silent if highest_still_m(each, silence) > 0.0)
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
@@ -383,8 +382,8 @@ class FlightControl:
         }
         return tuple(
             # Flight has no use for their maps, and the log would hold each of them at each tick.
-            neighbour._replace(is_piloted=neighbour.robot_id in piloted, shared=None)
-            for neighbour in (*heard, *told)
+            Neighbour(robot_id, position_m, velocity_m_s, age_s, trial, None, robot_id in piloted)
+            for robot_id, position_m, velocity_m_s, age_s, trial, _, _ in (*heard, *told)
         )
 
     def _revoked_places(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
@@ -400,13 +399,16 @@ class FlightControl:
         return tuple(stay)
 
     def _silent(
-        self, peers: tuple[HeardBeacon, ...], heard: tuple[Neighbour, ...], now_s: float
+        self,
+        peers: tuple[HeardBeacon, ...],
+        heard: tuple[Neighbour, ...],
+        silence: SilenceLimits,
+        now_s: float,
     ) -> tuple[Neighbour, ...]:
         """Who flew when it last told its place, and tells none now: it may come down there.
 
         Who is not listened to any more is none of these: its last word may have been a lie.
         """
-        silence = self.assignment.robot.separation.silence
         for beacon, heard_at_s in peers:
             told = last_word(beacon, silence)
             if beacon.armed is False:

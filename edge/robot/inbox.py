@@ -89,8 +89,6 @@ class Inbox:
         # Who said lately what could not be read, as `peers` found it.
         self.not_understood: tuple[str, ...] = ()
         self.not_understood_count = 0
-        # Robots that the ground hears and this one does not, as `peers` found it.
-        self.unheard: tuple[int, ...] = ()
         self._heard_by_ground: dict[int, _HeardByGround] = {}
         self._beacon_at_s: dict[int, float] = {}
 
@@ -260,7 +258,12 @@ class Inbox:
                 if now_s - at_s <= _BEACON_LIFETIME_S
             }
             self.not_understood = tuple(self._strangers)
-            self.unheard = tuple(
+            return tuple(self._beacons.values())
+
+    def unheard(self, now_s: float) -> tuple[int, ...]:
+        """Robots that the ground hears and this one does not."""
+        with self._lock:
+            return tuple(
                 robot_id
                 for robot_id, (since_s, at_s) in sorted(self._heard_by_ground.items())
                 if robot_id != self._robot_id
@@ -270,7 +273,6 @@ class Inbox:
                 and at_s - max(since_s, self._beacon_at_s.get(robot_id, -math.inf))
                 >= _HEARD_WITHIN_S
             )
-            return tuple(self._beacons.values())
 
 
 def _is_own(operator: str, speaker: Speaker) -> bool:

@@ -306,10 +306,10 @@ class RobotNode:
                 self._ports.clock.monotonic_s(), assignment, steers=control.flight.state in _STEERS
             )
             control.px4_change = self.readiness.px4_change
-        now_s = self._ports.clock.monotonic_s()
-        peers = self._inbox.peers(now_s)
         if not is_due:
             return
+        now_s = self._ports.clock.monotonic_s()
+        peers = self._inbox.peers(now_s)
         # A robot's own wall clock may be wrong: there is no internet on a field.
         ground_unix_s, own_unix_s = self._inbox.ground_unix_s(now_s), self._ports.clock.unix_s()
         unix_now_s = ground_unix_s or own_unix_s
@@ -323,7 +323,7 @@ class RobotNode:
             odometry=self._navigation.odometry(),
             peers=peers,
             not_understood=self._inbox.not_understood,
-            unheard=self._inbox.unheard,
+            unheard=self._inbox.unheard(now_s),
             fell_silent=control.fell_silent,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),

@@ -10,16 +10,13 @@ import tomllib
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
-
-from msgspec import Meta
+from typing import Any, Literal, Protocol
 
 from edge.core.file_errors import in_words
-from edge.core.frames import Latitude, Longitude
-from edge.core.schema import Bounded, ConfigError, NonNegative, from_mapping
+from edge.core.schema import ConfigError, from_mapping
 from edge.core.world import has_importance, parse_world
 from edge.messages.codes import texts
-from edge.messages.mission import FlightState, GroundState, Heading, Origin, RobotStatus
+from edge.messages.mission import FlightState, GroundState, Origin, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.procedure import Ground, Procedure, Until, fresh_snapshot, gather
 from lpac.ground.site import SavedSite, Sites, origin_at, places_at, standing
@@ -54,23 +51,22 @@ _REJOIN_WITHIN_S = 15.0
 _PERIOD_S = 0.2
 # What is due in less, by rounding, would never come on a clock that is counted.
 _LEAST_S = 0.01
-_Duration = Annotated[float, Meta(gt=0.0, le=36000.0)]
 
 # The file
 
 
 @dataclass(frozen=True, slots=True)
-class OriginStep(Bounded):
+class OriginStep:
     """Set the mission's origin: as given, or as `lpac mission origin --from` measures it."""
 
-    latitude_deg: Latitude | None = None
-    longitude_deg: Longitude | None = None
-    heading_deg: Heading | None = None
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    heading_deg: float | None = None
     from_robot: str = ""
     toward_robot: str = ""
-    average_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 5.0
+    average_s: float = 5.0
 
-    def check_rules(self) -> None:
+    def __post_init__(self) -> None:
         given = (self.latitude_deg, self.longitude_deg, self.heading_deg)
         if self.from_robot and given != (None, None, None):
             raise ValueError(
@@ -81,6 +77,9 @@ class OriginStep(Bounded):
             raise ValueError(
                 "latitude_deg, longitude_deg and heading_deg must be given, or from_robot"
             )
+        if not 0.0 < self.average_s <= 600.0:
+            raise ValueError(f"average_s = {self.average_s}: must be above 0, and at most 600")
+        self.given()
 
     def given(self) -> Origin | None:
         """The origin as it is written; None if it is to be measured."""
@@ -104,43 +103,51 @@ class WorldStep:
 
 
 @dataclass(frozen=True, slots=True)
-class PreflightStep(Bounded):
+class PreflightStep:
     """Enable the robots, and wait until all are ready."""
 
-    at_most_s: _Duration = 60.0
+    at_most_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        _check_duration("at_most_s", self.at_most_s)
 
 
 @dataclass(frozen=True, slots=True)
-class TakeoffStep(Bounded):
+class TakeoffStep:
     """Take off, one after another."""
 
-    interval_s: Annotated[float, Meta(ge=0.0, le=60.0)] = 2.0
+    interval_s: float = 2.0
     abort_on_failure: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.interval_s <= 60.0:
+            raise ValueError(f"interval_s = {self.interval_s}: must be from 0 to 60")
 
 
 @dataclass(frozen=True, slots=True)
-class Perturbation(Bounded):
+class Perturbation:
     """At that time of the mission, give a robot to a pilot, or take it back into the mission."""
 
-    at_s: NonNegative
+    at_s: float
     robot: str
     do: Literal["pilot", "rejoin"]
 
 
 @dataclass(frozen=True, slots=True)
-class MissionStep(Bounded):
+class MissionStep:
     """Fly the mission; `restart`: robots that come to hold by themselves are started again."""
 
-    duration_s: _Duration
+    duration_s: float
     restart: bool = False
     perturb: tuple[Perturbation, ...] = ()
 
-    def check_rules(self) -> None:
+    def __post_init__(self) -> None:
+        _check_duration("duration_s", self.duration_s)
         for perturbation in self.perturb:
-            if not perturbation.at_s < self.duration_s:
+            if not 0.0 <= perturbation.at_s < self.duration_s:
                 raise ValueError(
-                    f"perturb: at_s = {perturbation.at_s}: must be below duration_s = "
-                    f"{self.duration_s}"
+                    f"perturb: at_s = {perturbation.at_s}: must be 0 or above, and below "
+                    f"duration_s = {self.duration_s}"
                 )
         given: set[str] = set()
         for perturbation in self.in_time():
@@ -180,23 +187,24 @@ _NAMES = {kind: name for name, kind in (STEPS_BEFORE | STEPS).items()}
 
 
 @dataclass(frozen=True, slots=True)
-class ScriptTable(Bounded):
+class ScriptTable:
     """The file as it is written."""
 
-    trial: Annotated[
-        str,
-        Meta(
-            pattern=r"\A[A-Za-z0-9_-]{0,24}\Z",
-            description="at most 24 letters, digits, '-' and '_'",
-        ),
-    ] = ""
-    trials: Annotated[int, Meta(ge=1, le=1000)] = 1
+    trial: str = ""
+    trials: int = 1
     robots: tuple[str, ...] = ()
     before: tuple[dict, ...] = ()  # type: ignore[type-arg]
-    steps: Annotated[
-        tuple[dict, ...],  # type: ignore[type-arg]
-        Meta(min_length=1, description="one or more [[steps]] tables"),
-    ] = ()
+    steps: tuple[dict, ...] = ()  # type: ignore[type-arg]
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.trials <= 1000:
+            raise ValueError(f"trials = {self.trials}: must be from 1 to 1000")
+        if self.trial and re.fullmatch(r"[A-Za-z0-9_-]{1,24}", self.trial) is None:
+            raise ValueError(
+                f"trial = {self.trial!r}: must be 1 to 24 letters, digits, '-' and '_'"
+            )
+        if not self.steps:
+            raise ValueError("steps: none are given: write [[steps]] tables")
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,6 +298,11 @@ def _check_order(steps: Sequence[Step], where: str) -> None:
     if not isinstance(steps[-1], ReturnStep | LandStep):
         last = _NAMES[type(steps[-1])]
         raise ConfigError(f"{where}: the last step is {last!r}: must be 'return' or 'land'")
+
+
+def _check_duration(name: str, value_s: float) -> None:
+    if not 0.0 < value_s <= 36000.0:
+        raise ValueError(f"{name} = {value_s}: must be above 0, and at most 36000")
 
 
 # Flying it

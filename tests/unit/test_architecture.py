@@ -53,9 +53,12 @@ ALLOWED = {
     "lpac.sim.ports": set(),
     "lpac.sim.programs": set(),
     "lpac.radio": {"edge.core", "edge.messages", "edge.identity"},
+    "lpac.radio.figures": {
+        "edge.core", "edge.messages", "edge.identity", "lpac.analysis", "lpac.radio",
+    },
     "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
     "lpac.extras": set(),
-    "lpac.middleware": {
+    "lpac.network": {
         "edge.core", "edge.messages", "edge.drivers", "lpac.analysis", "lpac.extras",
         "lpac.radio", "lpac.sim.ports", "lpac.sim.programs",
     },
@@ -74,7 +77,7 @@ ALLOWED = {
         "lpac.analysis", "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch",
         "lpac.evaluate", "lpac.train", "lpac.ablate", "lpac.paper",
         "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
-        "lpac.radio.heat_map", "lpac.middleware",
+        "lpac.radio.heat_map", "lpac.network",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
@@ -89,12 +92,13 @@ ONLY_IN = {
         "lpac/train/",
         "lpac/ablate/",
         "lpac/paper/",
+        "lpac/radio/figures.py",
         "lpac/radio/heat_map.py",
-        "lpac/middleware/figures.py",
+        "lpac/network/figures.py",
     },
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},
-    "cyclonedds": {"lpac/middleware/over_cyclone.py"},
+    "cyclonedds": {"lpac/network/over_cyclone.py"},
     "mcap": {"edge/drivers/"},
     # Elsewhere it is `edge.core.logger`, which loads it without rich.
     "structlog": {"edge/core/logger.py", "edge/drivers/logs.py"},

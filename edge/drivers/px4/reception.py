@@ -68,6 +68,8 @@ class _Path:
     def __init__(self) -> None:
         self.streams: list[_Stream] = []
         self.newest_s: dict[int, float] = {}
+        # The greatest of them.
+        self.latest_s = -math.inf
         self.heard_at_s = -math.inf
 
     def nearest(self, number: int, now_s: float) -> _Stream | None:
@@ -75,6 +77,8 @@ class _Path:
         oldest_s = -math.inf if now_s - self.heard_at_s <= _SILENT_S else now_s
         oldest_s = max(oldest_s, now_s - _REMEMBERED_S)
         self.streams = [s for s in self.streams if s.heard_at_s >= oldest_s]
+        if len(self.streams) == 1:
+            return self.streams[0]
         return min(self.streams, key=lambda s: (number - s.newest - 1) % _NUMBERS, default=None)
 
     def begin_stream(self, number: int) -> _Stream:
@@ -105,6 +109,7 @@ class VehicleFrames:
         self._paths: dict[Hashable, _Path] = {}
         # Of each message that has the vehicle's time: that of the newest, when it came, and whence.
         self._newest: dict[int, tuple[float, float, Hashable]] = {}
+        self._latest_s = -math.inf
         # Of each content: when it was taken, by which path, and of which stream; oldest first.
         self._taken: dict[Hashable, tuple[float, Hashable, _Stream | None]] = {}
         self._seconds: deque[_Second] = deque(maxlen=_LOSS_S + 1)
@@ -114,9 +119,12 @@ class VehicleFrames:
         self._forget(now_s)
         if self._began_anew(frame, now_s):
             self._newest.clear()
+            self._latest_s = -math.inf
             self._paths.clear()
         self._forget_paths(now_s)
-        path = self._paths.setdefault(frame.path, _Path())
+        path = self._paths.get(frame.path)
+        if path is None:
+            path = self._paths[frame.path] = _Path()
         back_s = self._back_s(frame)
         sort, stream = self._sort(frame, path, now_s)
         is_old = back_s > 0.0
@@ -136,6 +144,7 @@ class VehicleFrames:
         if frame.vehicle_s is not None:
             second.timed += 1
             self._newest[frame.message_id] = frame.vehicle_s, now_s, frame.path
+            self._latest_s = max(self._latest_s, frame.vehicle_s)
         if frame.path != self.path and now_s - self._path_at_s > _SILENT_S:
             self.path = frame.path
         if frame.path == self.path:
@@ -144,8 +153,10 @@ class VehicleFrames:
 
     def lost(self, now_s: float) -> float:
         """The share of the frames that were lost in the last ten seconds, in steps of 5 %."""
-        seconds = self._within(_LOSS_S, now_s)
-        taken, lost = sum(s.taken for s in seconds), sum(s.lost for s in seconds)
+        taken = lost = 0
+        for second in self._within(_LOSS_S, now_s):
+            taken += second.taken
+            lost += second.lost
         return round(20.0 * lost / (taken + lost)) / 20.0 if taken + lost >= _LEAST_FRAMES else 0.0
 
     def arrives_twice(self, now_s: float) -> bool:
@@ -205,8 +216,7 @@ class VehicleFrames:
 
     def _is_late(self, path: _Path) -> bool:
         """Whether what comes by this path is older than what came by another."""
-        newest_s = max((newest_s for newest_s, _, _ in self._newest.values()), default=-math.inf)
-        return max(path.newest_s.values(), default=-math.inf) < newest_s - _LATE_S
+        return path.latest_s < self._latest_s - _LATE_S
 
     def _sort(self, frame: Frame, path: _Path, now_s: float) -> tuple[_Sort, _Stream | None]:
         """Classify a frame against its path's and those that were taken, and find its stream."""
@@ -227,6 +237,7 @@ class VehicleFrames:
             comes_next = frame.vehicle_s >= newest_s
             is_late = frame.vehicle_s < newest_s - _BACK_S
             path.newest_s[frame.message_id] = max(newest_s, frame.vehicle_s)
+            path.latest_s = max(path.latest_s, frame.vehicle_s)
             if stream is not None and follows:
                 # With no other stream there is nothing newer to take instead.
                 stream.is_late = is_late and len(path.streams) > 1

@@ -488,21 +488,16 @@ class _Fix(NamedTuple):
             return self
         if not 0.0 < between_s <= _SLIP_WITHIN_S:
             return self
-        slipped_m = tuple(
-            moved_m - (was_m_s + is_m_s) / 2.0 * between_s
-            for moved_m, was_m_s, is_m_s in zip(
-                _shift_m(last.place, self.place)[:2],
-                last.velocity_m_s,
-                self.velocity_m_s,
-                strict=True,
-            )
-        )
-        kept = math.exp(-between_s / _SLIP_S)
-        north_m, east_m = (kept * slip_m for slip_m in last.slip_m)
+        north_m, east_m, _ = _shift_m(last.place, self.place)
+        (was_north, was_east), (is_north, is_east) = last.velocity_m_s, self.velocity_m_s
+        north_m -= (was_north + is_north) / 2.0 * between_s
+        east_m -= (was_east + is_east) / 2.0 * between_s
         # A jump is noticed by itself, as of the estimate.
-        if math.hypot(*slipped_m) < _SLIP_JUMP_M:
-            north_m, east_m = north_m + slipped_m[0], east_m + slipped_m[1]
-        return self._replace(slip_m=(north_m, east_m))
+        if math.hypot(north_m, east_m) >= _SLIP_JUMP_M:
+            north_m = east_m = 0.0
+        kept, (last_north_m, last_east_m) = math.exp(-between_s / _SLIP_S), last.slip_m
+        slip_m = kept * last_north_m + north_m, kept * last_east_m + east_m
+        return _Fix(self.time_s, self.place, self.velocity_m_s, slip_m)
 
 
 class _VehicleClock:

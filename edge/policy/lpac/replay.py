@@ -15,9 +15,6 @@ from edge.policy.lpac.policy import LpacPolicy
 
 _Array = npt.NDArray[Any]
 
-# Whoever sent it, in whatever mission frame: a robot's own message is read like any other.
-_NOBODY = -1
-
 
 class ReplayError(ValueError):
     """The messages are not those of a flight with this policy; the text says which and why."""
@@ -122,7 +119,6 @@ def _decoded(policy: LpacPolicy, data: bytes) -> AggregatedMessage:
         data,
         bundle_id=policy.bundle_id,
         frame_id=None,
-        own_robot_id=_NOBODY,
         message_size=policy.geometry.message_size,
         shared_side=perception.shared_map_side if perception else 0,
     )

@@ -108,7 +108,6 @@ def recorded_steps(folder: Path, robot_id: int, policy: Policy) -> RecordedSteps
                 message["message"],
                 bundle_id=policy.bundle_id,
                 frame_id=None,
-                own_robot_id=-1,
                 message_size=policy.message_size,
                 shared_side=perception.shared_map_side if perception else 0,
             )

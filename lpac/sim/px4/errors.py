@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
+from edge.core.vehicle import Vector
+from lpac.sim.px4.vector import plus, times, vector
 
 # Of the whole horizontal error of a receiver.
 LEAST_BIAS_M, GREATEST_BIAS_M = 1.0, 5.0
@@ -91,7 +93,7 @@ class Errors:
         self._yaw_reset_s = float(own.uniform(*_YAW_RESETS_S)) if resets else math.inf
 
         direction_rad = float(common.uniform(0.0, math.tau))
-        self._wind_direction = np.array([math.cos(direction_rad), math.sin(direction_rad), 0.0])
+        self._wind_direction = math.cos(direction_rad), math.sin(direction_rad), 0.0
         self._mean_wind_m_s = float(common.uniform(*_MEAN_WINDS_M_S))
         self._gust_rad_s = math.tau / float(common.uniform(*_GUST_PERIODS_S))
 
@@ -107,8 +109,8 @@ class Errors:
             for _ in range(3)
         ]
         bearing_rad = float(own.uniform(0.0, math.tau))
-        self._echo_m = float(own.uniform(*_ECHOES_M)) * np.array(
-            [math.cos(bearing_rad), math.sin(bearing_rad), 0.0]
+        self._echo_m = times(
+            (math.cos(bearing_rad), math.sin(bearing_rad), 0.0), float(own.uniform(*_ECHOES_M))
         )
         self._echo_every_s = float(own.uniform(*_ECHO_EVERY_S))
         self._echo_for_s = float(own.uniform(*_ECHO_FOR_S))
@@ -121,37 +123,36 @@ class Errors:
             for _ in range(2)
         ]
 
-    def position_m(self, time_s: float, bias_m: F64) -> F64:
-        """(3,), north, east, down: what the estimate errs by, of a receiver that began with a bias.
+    def position_m(self, time_s: float, bias_m: F64) -> Vector:
+        """North, east, down: what the estimate errs by, of a receiver that began with a bias.
 
         `bias_m` is (3,); a receiver without any horizontal one does not walk.
         """
-        north_m, east_m, down_m = bias_m.tolist()
+        north_m, east_m, down_m = vector(bias_m)
         if began_m := math.hypot(north_m, east_m):
             length_m = min(max(began_m + self._walk[0].at(time_s), LEAST_BIAS_M), GREATEST_BIAS_M)
             turn_rad = self._walk[1].at(time_s) / began_m
             factor = length_m / began_m
             cos, sin = factor * math.cos(turn_rad), factor * math.sin(turn_rad)
             north_m, east_m = cos * north_m - sin * east_m, sin * north_m + cos * east_m
-        return np.array([north_m, east_m, down_m + self.height_m(time_s)])
+        return north_m, east_m, down_m + self.height_m(time_s)
 
-    def fix_m(self, time_s: float) -> F64:
-        """(3,), north, east, down: by how much a receiver's fix is further off than the estimate.
+    def fix_m(self, time_s: float) -> Vector:
+        """North, east, down: by how much a receiver's fix is further off than the estimate.
 
         It is noise of a few decimetres, and an echo of up to 3.5 m for some seconds.
         """
         noise_m = [math.fsum([wave.about(time_s) for wave in waves]) for waves in self._fix]
         since_s = time_s % self._echo_every_s - (self._echo_every_s - self._echo_for_s)
         echo = math.sin(math.pi * since_s / self._echo_for_s) if since_s > 0.0 else 0.0
-        fix_m: F64 = np.array(noise_m) + echo * self._echo_m
-        return fix_m
+        return plus(noise_m, times(self._echo_m, echo))
 
-    def velocity_m_s(self, time_s: float) -> F64:
-        """(3,), north, east, down: what the estimate of the velocity errs by; 0 down."""
+    def velocity_m_s(self, time_s: float) -> Vector:
+        """North, east, down: what the estimate of the velocity errs by; 0 down."""
         north, east = (
             math.fsum([wave.about(time_s) for wave in waves]) for waves in self._velocity
         )
-        return np.array([north, east, 0.0])
+        return north, east, 0.0
 
     def gps_accuracy_m(self, time_s: float) -> tuple[float, float]:
         """What the receiver says of its fix, horizontally and vertically."""
@@ -176,12 +177,11 @@ class Errors:
         """By how much the compass is wrong; the estimator may notice in flight, in one go."""
         return self._heading_rad if time_s < self._yaw_reset_s else self._heading_after_rad
 
-    def wind_m_s(self, time_s: float) -> F64:
-        """(3,): where the air goes, gusts and all; the same for the whole fleet."""
+    def wind_m_s(self, time_s: float) -> Vector:
+        """Where the air goes, gusts and all; the same for the whole fleet."""
         gust = max(0.0, math.sin(self._gust_rad_s * time_s)) ** 3
         speed_m_s = self._mean_wind_m_s + (GREATEST_WIND_M_S - self._mean_wind_m_s) * gust
-        wind: F64 = speed_m_s * self._wind_direction
-        return wind
+        return times(self._wind_direction, speed_m_s)
 
     def is_remote_control_stale(self, time_s: float) -> bool:
         """Whether the remote control's receiver hears nothing just now."""

@@ -4,12 +4,12 @@ Times are those of a real PX4 v1.17, by its own clock.
 """
 
 import math
+from collections.abc import Sequence
 
-import numpy as np
+from edge.core.vehicle import Vector
+from lpac.sim.px4.vector import ZERO, level, minus, plus, times
 
-from edge.core import F64
-
-NOISE_M = np.array([0.15, 0.15, 0.1])
+NOISE_M = (0.15, 0.15, 0.1)
 NOISE_TIME_S = 10.0
 # After the start: when the origin is chosen and the attitude found; how long before the position is
 # good the attitude is trusted, and GPS is used.
@@ -33,20 +33,18 @@ GPS_BY_PLACE, GPS_VELOCITY_BY_VELOCITY = (0.96, 0.33, 0.12), 0.25
 class Estimator:
     """A vehicle's knowledge of its position, as time passes."""
 
-    def __init__(self, ready_after_s: float, noise_m: F64) -> None:
-        """The position is good `ready_after_s` after the start; `noise_m` (3,) errs first."""
+    def __init__(self, ready_after_s: float, noise_m: Vector) -> None:
+        """The position is good `ready_after_s` after the start; `noise_m` errs first."""
         self._ready_after_s = ready_after_s
         self._time_s = 0.0
         self._noise_m = noise_m
-        self._drift_m: F64 = np.zeros(3)
+        self._drift_m = ZERO
         # Noise, what dead reckoning has gathered, jumps it believes: north, east, down.
-        self.error_m: F64 = noise_m
+        self.error_m = noise_m
         # It has never been there.
         self._gps_lost_since_s = -math.inf
         self._gps_back_at_s = -math.inf
-        self._followed_m: F64 = np.zeros(3)
-        self.velocity_error_m_s: F64 = np.zeros(3)
-        self._tilt_error_m_s2: F64 = np.zeros(3)
+        self._followed_m = self.velocity_error_m_s = self._tilt_error_m_s2 = ZERO
         self._followed_once = False
         self._rejects_since_s = math.inf
 
@@ -116,22 +114,28 @@ class Estimator:
         return is_back and self._time_s - self._gps_lost_since_s < without_gps_s
 
     def step(
-        self, time_s: float, dt_s: float, has_gps: bool, off_m: F64, off_m_s: F64, draws: F64
+        self,
+        time_s: float,
+        dt_s: float,
+        has_gps: bool,
+        off_m: Vector,
+        off_m_s: Vector,
+        draws: Sequence[float],
     ) -> None:
-        """One step of time: the fix's place and velocity err by `off_m` and `off_m_s` (3,).
+        """One step of time: the fix's place and velocity err by `off_m` and `off_m_s`.
 
         `draws` (6,) are normal.
         """
         self._time_s = time_s
         if has_gps:
             # Mostly there is nothing to follow, and never was.
-            self._followed_once = self._followed_once or bool(off_m.any() or off_m_s.any())
+            self._followed_once = self._followed_once or any(off_m) or any(off_m_s)
             if self._followed_once:
                 self._follow(off_m, off_m_s, dt_s)
         else:
             # Without it, gravity tells the tilt.
-            self._tilt_error_m_s2 = np.zeros(3)
-            self._followed_m = self._followed_m + self.velocity_error_m_s * dt_s
+            self._tilt_error_m_s2 = ZERO
+            self._followed_m = plus(self._followed_m, times(self.velocity_error_m_s, dt_s))
         if not has_gps:
             self._gps_lost_since_s = min(self._gps_lost_since_s, time_s)
         elif not self.has_gps:
@@ -139,28 +143,34 @@ class Estimator:
                 self._gps_back_at_s = time_s + GPS_REGAIN_S
             self._gps_lost_since_s = math.inf
         decay = dt_s / NOISE_TIME_S
-        self._noise_m = self._noise_m * (1.0 - decay) + NOISE_M * draws[:3] * math.sqrt(2.0 * decay)
+        kept, grows = 1.0 - decay, math.sqrt(2.0 * decay)
+        north_m, east_m, down_m = self._noise_m
+        self._noise_m = (
+            north_m * kept + NOISE_M[0] * draws[0] * grows,
+            east_m * kept + NOISE_M[1] * draws[1] * grows,
+            down_m * kept + NOISE_M[2] * draws[2] * grows,
+        )
         if self.has_gps:
-            self._drift_m = np.zeros(3)
+            self._drift_m = ZERO
         else:
             step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
-            self._drift_m = self._drift_m + step_m * draws[3:6] * (1.0, 1.0, 0.0)
-        self.error_m = self._noise_m + self._drift_m + self._followed_m
+            self._drift_m = plus(self._drift_m, level(times(draws[3:6], step_m)))
+        self.error_m = plus(plus(self._noise_m, self._drift_m), self._followed_m)
 
-    def _follow(self, off_m: F64, off_m_s: F64, dt_s: float) -> None:
+    def _follow(self, off_m: Vector, off_m_s: Vector, dt_s: float) -> None:
         """Go after a fix that lies; where it is too far off to be true, wait, then start over."""
-        place_m, speed_m_s = off_m - self._followed_m, off_m_s - self.velocity_error_m_s
-        far = math.hypot(*place_m.tolist()) > GPS_GATE_M
-        far = far or math.hypot(*speed_m_s.tolist()) > GPS_GATE_M_S
+        place_m = minus(off_m, self._followed_m)
+        speed_m_s = minus(off_m_s, self.velocity_error_m_s)
+        far = math.hypot(*place_m) > GPS_GATE_M or math.hypot(*speed_m_s) > GPS_GATE_M_S
         self._rejects_since_s = min(self._rejects_since_s, self._time_s) if far else math.inf
         if self._time_s - self._rejects_since_s >= GPS_REJECTED_S:
-            self._followed_m, self.velocity_error_m_s = off_m.copy(), off_m_s.copy()
+            self._followed_m, self.velocity_error_m_s = off_m, off_m_s
             return
-        rates = self.velocity_error_m_s, self._tilt_error_m_s2, np.zeros(3)
+        rates = self.velocity_error_m_s, self._tilt_error_m_s2, ZERO
         if not far:
-            by_position, by_velocity, by_tilt = (gain * place_m for gain in GPS_BY_PLACE)
-            by_velocity = by_velocity + GPS_VELOCITY_BY_VELOCITY * speed_m_s
-            rates = rates[0] + by_position, rates[1] + by_velocity, by_tilt
-        self._followed_m = self._followed_m + rates[0] * dt_s
-        self.velocity_error_m_s = self.velocity_error_m_s + rates[1] * dt_s
-        self._tilt_error_m_s2 = self._tilt_error_m_s2 + rates[2] * dt_s
+            by_position, by_velocity, by_tilt = (times(place_m, gain) for gain in GPS_BY_PLACE)
+            by_velocity = plus(by_velocity, times(speed_m_s, GPS_VELOCITY_BY_VELOCITY))
+            rates = plus(rates[0], by_position), plus(rates[1], by_velocity), by_tilt
+        self._followed_m = plus(self._followed_m, times(rates[0], dt_s))
+        self.velocity_error_m_s = plus(self.velocity_error_m_s, times(rates[1], dt_s))
+        self._tilt_error_m_s2 = plus(self._tilt_error_m_s2, times(rates[2], dt_s))

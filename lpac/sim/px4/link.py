@@ -10,15 +10,15 @@ import math
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
-from edge.core import F64
 from lpac.sim.px4.checks import Component, Px4Event
 from lpac.sim.px4.modes import CUSTOM_MODES, PILOTED, MavResult, Px4Mode
+from lpac.sim.px4.vector import minus
 from lpac.sim.px4.vehicle import GRAVITY_M_S2, Px4Setpoint, Px4Vehicle, SimulatedSensor
 from lpac.sim.px4.wire import OnTheWire
 from lpac.sim.px4.world import FencePolygon
@@ -328,10 +328,11 @@ class Px4Link:
         vehicle = self.vehicle
         report = vehicle.health
         present, healthy = 0, _NEVER_ILL
+        has, ill = (frozenset(),) * 2 if report is None else (report.present, report.unhealthy)
         for component, bits in _HEARD_OF.items():
-            if report is not None and component in report.present:
+            if component in has:
                 present |= bits
-            if report is None or component not in report.unhealthy:
+            if component not in ill:
                 healthy |= bits
         enabled = present | sum(bits for bits in _HEARD_OF.values() if not healthy & bits)
         if report is not None and report.can_arm(vehicle.mode):
@@ -434,7 +435,7 @@ class Px4Link:
         home, home_m = self.vehicle.global_home, self.vehicle.home_m
         if home is None or home_m is None:
             return None
-        local_m = (home_m - self.vehicle.estimator_origin_m).tolist()
+        local_m = minus(home_m, self.vehicle.estimator_origin_m.tolist())
         no_rotation, no_approach = [1.0, 0.0, 0.0, 0.0], [math.nan] * 3
         return mavlink.MAVLink_home_position_message(
             *_as_integers(home), *local_m, no_rotation, *no_approach, self._boot_ms() * 1000
@@ -459,7 +460,7 @@ class Px4Link:
                 0, 0, 0, 0, 0, unknown, unknown, unknown, unknown, 0xFF
             )
         self._gps_told_at_s = vehicle.time_s
-        v_north, v_east, _ = vehicle.fix_velocity_m_s.tolist()
+        v_north, v_east, _ = vehicle.fix_velocity_m_s
         speed_cm_s = round(100.0 * math.hypot(v_north, v_east))
         course_cdeg = round(100.0 * math.degrees(math.atan2(v_east, v_north))) % 36000
         place = _as_integers(vehicle.global_fix)
@@ -487,9 +488,9 @@ class Px4Link:
             self._boot_ms(), roll, pitch, yaw_rad, 0.0, 0.0, self.vehicle.yaw_rate_rad_s
         )
 
-    def _body(self, vector: F64) -> tuple[float, float, float]:
+    def _body(self, vector: Sequence[float]) -> tuple[float, float, float]:
         """From the world frame to the level body frame: forward, right, down."""
-        north, east, down = vector.tolist()
+        north, east, down = vector
         cos, sin = (
             math.cos(self.vehicle.estimated_heading_rad),
             math.sin(self.vehicle.estimated_heading_rad),
@@ -552,7 +553,7 @@ class Px4Link:
             mavlink.MAV_FRAME_BODY_FRD,
             *vehicle.local_position_m.tolist(),
             level,
-            *self._body(vehicle.estimated_velocity_m_s),
+            *self._body(vehicle.estimated_velocity_m_s.tolist()),
             0.0,
             0.0,
             vehicle.yaw_rate_rad_s,

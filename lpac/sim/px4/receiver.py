@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edge.core import F64
-
-_IN_THE_PLANE = np.array([1.0, 1.0, 0.0])
+from edge.core.vehicle import Vector
+from lpac.sim.px4.vector import ZERO, level, minus, plus, times
 
 
 def _zeros() -> F64:
@@ -28,35 +28,32 @@ class Receiver:
     creep_m_s: F64 = field(default_factory=_zeros)
     velocity_bias_m_s: F64 = field(default_factory=_zeros)
     scatter_m: float = 0.0
-    _crept_m: F64 = field(default_factory=_zeros)
-    _scattered_m: F64 = field(default_factory=_zeros)
-    _stuck_at_m: F64 | None = None
+    _crept_m: Vector = ZERO
+    _scattered_m: Vector = ZERO
+    _stuck_at_m: Vector | None = None
 
-    def step(self, dt_s: float, fix_m: Callable[[], F64], rng: np.random.Generator) -> None:
-        """One step of time; `fix_m` gives what it would tell, (3,)."""
+    def step(self, dt_s: float, fix_m: Callable[[], Vector], rng: np.random.Generator) -> None:
+        """One step of time; `fix_m` gives what it would tell."""
         if not self.stuck:
             self._stuck_at_m = None
         elif self._stuck_at_m is None:
             self._stuck_at_m = fix_m()
-        self._crept_m = self._crept_m + self.creep_m_s * dt_s
+        self._crept_m = plus(self._crept_m, times(self.creep_m_s.tolist(), dt_s))
         if self.scatter_m:
-            self._scattered_m = self.scatter_m * rng.standard_normal(3) * _IN_THE_PLANE
+            self._scattered_m = level(times(rng.standard_normal(3).tolist(), self.scatter_m))
 
-    def place_m(self, true_m: F64) -> F64:
-        """(3,): the place that it tells; `true_m` if it is honest."""
+    def place_m(self, true_m: Vector) -> Vector:
+        """The place that it tells; `true_m` if it is honest."""
         if self._stuck_at_m is not None:
             return self._stuck_at_m
-        place_m: F64 = true_m + self._crept_m + self._scattered_m
-        return place_m
+        return plus(plus(true_m, self._crept_m), self._scattered_m)
 
-    def velocity_m_s(self, true_m_s: F64) -> F64:
-        """(3,): the velocity that it tells."""
+    def velocity_m_s(self, true_m_s: Vector) -> Vector:
+        """The velocity that it tells."""
         if self._stuck_at_m is not None:
-            return _zeros()
-        velocity_m_s: F64 = true_m_s + self.velocity_bias_m_s
-        return velocity_m_s
+            return ZERO
+        return plus(true_m_s, self.velocity_bias_m_s.tolist())
 
-    def off_m(self, true_m: F64) -> F64:
-        """(3,): how far its place is off in the plane. Heights go by the barometer."""
-        off_m: F64 = (self.place_m(true_m) - true_m) * _IN_THE_PLANE
-        return off_m
+    def off_m(self, true_m: Vector) -> Vector:
+        """How far its place is off in the plane. Heights go by the barometer."""
+        return level(minus(self.place_m(true_m), true_m))

@@ -13,11 +13,12 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from edge.core import F64
+from edge.core.vehicle import Vector
 from lpac.sim.px4 import checks
 from lpac.sim.px4.checks import (
     ArmingProblem,
@@ -47,6 +48,7 @@ from lpac.sim.px4.modes import (
 )
 from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.receiver import Receiver
+from lpac.sim.px4.vector import ZERO, level, minus, plus, times, vector
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
@@ -123,10 +125,6 @@ class SimulatedSensor(Enum):
     BATTERY = "battery"
 
 
-# North, east, down: single numbers, which cost a tenth of what arrays of three do.
-_Vector = tuple[float, float, float]
-_STILL: _Vector = (0.0, 0.0, 0.0)
-
 _ARMED_BY, _DISARMED_BY = 9489139, 16017271
 _BY_COMMAND, _BY_LANDING, _BEFORE_FLIGHT, _BY_FAILSAFE = 4, 6, 7, 14
 _ARMING_DENIED, _DISARMING_DENIED = 133277, 9091509
@@ -152,8 +150,7 @@ _ACTIONS = {
 _CAUSES = {FailsafeCause.MANUAL_CONTROL_LOST: 1, FailsafeCause.GROUND_STATION_LOST: 2}
 
 
-@dataclass(frozen=True, slots=True)
-class Truth:
+class Truth(NamedTuple):
     """What is really so at one time: world frame, m and m/s.
 
     `setpoint_at_s` is when the last setpoint came, -inf before the first, and `follows` what it
@@ -162,8 +159,8 @@ class Truth:
     """
 
     time_s: float
-    position_m: tuple[float, float, float]
-    velocity_m_s: tuple[float, float, float]
+    position_m: Vector
+    velocity_m_s: Vector
     mode: Px4Mode
     armed: bool
     landed: bool
@@ -216,31 +213,31 @@ class Px4Vehicle:
             [*draw_bias_m(share, bearing_rad), self._rng.uniform(-1.5, 1.5)]
         )
         self._errors = errors
-        self._walk_m = self._velocity_error_m_s = np.zeros(3)
+        self._walk_m = self._velocity_error_m_s = ZERO
         self._compass_rad = self.compass_jump_rad = self.motor_loss = self.thrust = 0.0
         self.parameters: dict[str, int | float] = dict(PARAMETERS)
         self.fence: tuple[FencePolygon, ...] = ()
         self.truth: list[Truth] = []
 
         self.time_s, self.commands, self.wire = 0.0, 0, MavlinkWire()
-        self.position_m: F64 = np.array([*start_m, 0.0])
-        self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
+        self._position_m: Vector = (*start_m, 0.0)
+        self._velocity_m_s = self.acceleration_m_s2 = ZERO
         self.heading_rad, self.yaw_rate_rad_s = heading_rad, 0.0
 
-        self.gust_m_s = 0.0
-        self.wind_m_s = self._gust = self.air_m_s = self.compensated_wind_m_s = np.zeros(3)
+        self.wind_m_s, self.gust_m_s = np.zeros(3), 0.0
+        self._gust_m_s = self._air_m_s = self._compensated_wind_m_s = ZERO
         self.battery_remaining, self._battery_warning = 1.0, 1
 
         self.gps_lost = self.estimate_frozen = False
         self.gps_jump_m = self.gps_offset_m = self.gps_drift_m_s = np.zeros(3)
         self.gps_told_m: float | None = None
         self.receiver = Receiver()
-        self._frozen: tuple[F64, F64] | None = None
+        self._frozen: tuple[Vector, Vector] | None = None
         self.dead_sensors: set[SimulatedSensor] = set()
         self._dead_since_s: dict[SimulatedSensor, float] = {}
         self.estimator = Estimator(
             drawn_ready_s if ready_after_s is None else ready_after_s,
-            NOISE_M * self._rng.standard_normal(3),
+            vector(self._rng.standard_normal(3) * NOISE_M),
         )
         self._vertical_drift_m_s = 0.0
         self.estimator_origin_m: F64 = self.estimated_position_m + self._rng.normal(
@@ -251,17 +248,17 @@ class Px4Vehicle:
         self.mode = self.intended_mode = self._mode_after_disarm = Px4Mode.HOLD
         self._mode_commands = 0
         self.landed = True
-        self.home_m: F64 | None = None
+        self.home_m: Vector | None = None
         self._armed_at_s = 0.0
         self._lift_began_s: float | None = None
         self._on_ground_since_s, self._off_ground_since_s = -math.inf, math.inf
         self._takeoff_down_m = 0.0
-        self._hold_m: F64 | None = None
+        self._hold_m: Vector | None = None
 
         self._setpoint: Px4Setpoint | None = None
         self._setpoint_at_s = -math.inf
         self.rc_connected = self._rc_at_arming = self._outside_fence = False
-        self._sticks_m_s: F64 = np.zeros(3)
+        self._sticks_m_s = ZERO
         self._ground_station_at_s = -math.inf
         self._fence_latch = -1
         self.failsafe = Failsafe()
@@ -269,21 +266,41 @@ class Px4Vehicle:
         self._reporter = HealthReporter()
         self._events: list[Px4Event] = []
 
+    @property
+    def position_m(self) -> F64:
+        """(3,), world frame: where the vehicle is. It may be set."""
+        return np.array(self._position_m)
+
+    @position_m.setter
+    def position_m(self, position_m: F64) -> None:
+        self._position_m = vector(position_m)
+
+    @property
+    def velocity_m_s(self) -> F64:
+        """(3,), world frame."""
+        return np.array(self._velocity_m_s)
+
     # What the vehicle believes
 
     @property
     def estimated_position_m(self) -> F64:
         """(3,), world frame: where the vehicle takes itself to be."""
+        return np.array(self._estimated_m())
+
+    def _estimated_m(self) -> Vector:
         if self._frozen is not None:
             return self._frozen[0]
-        return self.position_m + self._shared_error_m + self.estimator.error_m
+        return plus(plus(self._position_m, self._shared_error_m()), self.estimator.error_m)
 
     @property
     def estimated_velocity_m_s(self) -> F64:
         """(3,), world frame: how fast the vehicle takes itself to be."""
+        return np.array(self._estimated_m_s())
+
+    def _estimated_m_s(self) -> Vector:
         if self._frozen is not None:
             return self._frozen[1]
-        return self.velocity_m_s + self._velocity_error_m_s
+        return plus(self._velocity_m_s, self._velocity_error_m_s)
 
     @property
     def estimated_heading_rad(self) -> float:
@@ -298,7 +315,7 @@ class Px4Vehicle:
     @property
     def global_position(self) -> tuple[float, float, float]:
         """The estimate: latitude and longitude, deg, height above mean sea level, m."""
-        return self._world.to_global(self.estimated_position_m)
+        return self._world.to_global(self._estimated_m())
 
     @property
     def global_fix(self) -> tuple[float, float, float]:
@@ -309,23 +326,21 @@ class Px4Vehicle:
         return self._world.to_global(self.receiver.place_m(self._honest_fix_m()))
 
     @property
-    def fix_velocity_m_s(self) -> F64:
-        """(3,), world frame: how fast the receiver says to move."""
-        return self.receiver.velocity_m_s(self.velocity_m_s)
+    def fix_velocity_m_s(self) -> Vector:
+        """World frame: how fast the receiver says to move."""
+        return self.receiver.velocity_m_s(self._velocity_m_s)
 
-    def _honest_fix_m(self) -> F64:
-        noise_m = FIX_NOISE_M * np.sin(self.time_s * FIX_NOISE_RAD_S)
+    def _honest_fix_m(self) -> Vector:
+        noise_m = vector(FIX_NOISE_M * np.sin(self.time_s * FIX_NOISE_RAD_S))
         if self._errors is not None:
-            noise_m = noise_m + self._errors.fix_m(self.time_s)
-        late_m = self.position_m - GPS_LAG_S * self.velocity_m_s
-        fix_m: F64 = late_m + self._shared_error_m + self.gps_jump_m + noise_m
-        return fix_m
+            noise_m = plus(noise_m, self._errors.fix_m(self.time_s))
+        late_m = minus(self._position_m, times(self._velocity_m_s, GPS_LAG_S))
+        honest_m = plus(late_m, self._shared_error_m())
+        return plus(plus(honest_m, self.gps_jump_m.tolist()), noise_m)
 
-    @property
-    def _shared_error_m(self) -> F64:
-        """(3,): what fix and estimate err by together."""
-        error_m: F64 = self.gps_bias_m + self._walk_m + self.gps_offset_m
-        return error_m
+    def _shared_error_m(self) -> Vector:
+        """What fix and estimate err by together."""
+        return plus(plus(self.gps_bias_m.tolist(), self._walk_m), self.gps_offset_m.tolist())
 
     @property
     def gps_accuracy_m(self) -> tuple[float, float, float]:
@@ -441,7 +456,7 @@ class Px4Vehicle:
         self._lift_began_s = None
         self._rc_at_arming = self.rc_connected
         self.failsafe.reset()
-        self.home_m = self.estimated_position_m
+        self.home_m = self._estimated_m()
         text = "Armed by external command\t"
         self._say(_ARMED_BY, Level.INFO, text, bytes([_BY_COMMAND]))
         return MavResult.ACCEPTED
@@ -516,13 +531,14 @@ class Px4Vehicle:
 
     def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
         """Sticks alone take the vehicle only where COM_RC_OVERRIDE allows it."""
-        self._sticks_m_s = np.array([*velocity_m_s] or [0.0] * 3)
+        north, east, down = velocity_m_s or ZERO
+        self._sticks_m_s = north, east, down
         if self.mode in PILOTED:
             # It stays where the sticks are let go, not where they were let go before.
             self._hold_m = None
         bit = 2 if self.mode is Px4Mode.OFFBOARD else 1
         override = int(self.parameters["COM_RC_OVERRIDE"]) & bit
-        if self.mode not in PILOTED and override and self.rc_heard and self._sticks_m_s.any():
+        if self.mode not in PILOTED and override and self.rc_heard and any(self._sticks_m_s):
             self.set_mode(Px4Mode.POSCTL)
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
@@ -536,23 +552,24 @@ class Px4Vehicle:
         if not self.estimate_frozen:
             self._frozen = None
         elif self._frozen is None:
-            self._frozen = self.estimated_position_m, self.estimated_velocity_m_s
+            self._frozen = self._estimated_m(), self._estimated_m_s()
         self.time_s += dt_s
         self._watch_sensors()
         self._estimate(dt_s)
         self.gps_offset_m = self.gps_offset_m + self.gps_drift_m_s * dt_s
-        self.air_m_s = self.wind_m_s + self._gust
+        self._air_m_s = plus(self.wind_m_s.tolist(), self._gust_m_s)
         self._velocity_error_m_s = self.estimator.velocity_error_m_s
         if self._errors is not None:
-            self._walk_m = self._errors.position_m(self.time_s, self.gps_bias_m) - self.gps_bias_m
+            errs_m = self._errors.position_m(self.time_s, self.gps_bias_m)
+            self._walk_m = minus(errs_m, self.gps_bias_m.tolist())
             self._compass_rad = self._errors.heading_rad(self.time_s) + self.compass_jump_rad
-            self.air_m_s = self.air_m_s + self._errors.wind_m_s(self.time_s)
+            self._air_m_s = plus(self._air_m_s, self._errors.wind_m_s(self.time_s))
             # Who stands on the ground is known to.
-            lifted = min(max(-float(self.position_m[2]) / _ERRS_FROM_M, 0.0), 1.0)
-            errors_m_s = lifted * self._errors.velocity_m_s(self.time_s)
-            self._velocity_error_m_s = self._velocity_error_m_s + errors_m_s
+            lifted = min(max(-self._position_m[2] / _ERRS_FROM_M, 0.0), 1.0)
+            errors_m_s = times(self._errors.velocity_m_s(self.time_s), lifted)
+            self._velocity_error_m_s = plus(self._velocity_error_m_s, errors_m_s)
         if self.home_m is None and self.estimator.has_attitude and self.estimator.has_gps:
-            self.home_m = self.estimated_position_m
+            self.home_m = self._estimated_m()
         if self.armed:
             drain = 1.0 if self._errors is None else self._errors.drain
             drained = drain * self.current_a / (IDLE_A + HOVER_A) * dt_s
@@ -570,22 +587,21 @@ class Px4Vehicle:
             self._record_truth()
 
     def _estimate(self, dt_s: float) -> None:
-        draws = self._rng.standard_normal(10)
+        draws = self._rng.standard_normal(10).tolist()
         has_gps = not self.gps_lost and SimulatedSensor.GPS not in self.dead_sensors
         has_gps = has_gps and bool(self.parameters["EKF2_GPS_CTRL"])
         self.receiver.step(dt_s, self._honest_fix_m, self._rng)
-        off_m = self.gps_jump_m + self.receiver.off_m(self.position_m + self._shared_error_m)
-        off_m_s = (self.fix_velocity_m_s - self.velocity_m_s) * (1.0, 1.0, 0.0)
+        told_m = plus(self._position_m, self._shared_error_m())
+        off_m = plus(self.gps_jump_m.tolist(), self.receiver.off_m(told_m))
+        off_m_s = level(minus(self.fix_velocity_m_s, self._velocity_m_s))
         self.estimator.step(self.time_s, dt_s, has_gps, off_m, off_m_s, draws[:6])
         decay = dt_s / VERTICAL_DRIFT_TIME_S
-        self._vertical_drift_m_s += -self._vertical_drift_m_s * decay + VERTICAL_DRIFT_M_S * float(
-            draws[6]
-        ) * math.sqrt(2.0 * decay)
-        if self.gust_m_s or self._gust.any():
+        grows_m_s = VERTICAL_DRIFT_M_S * draws[6] * math.sqrt(2.0 * decay)
+        self._vertical_drift_m_s += -self._vertical_drift_m_s * decay + grows_m_s
+        if self.gust_m_s or any(self._gust_m_s):
             decay = dt_s / WIND_COMPENSATION_S
-            self._gust = self._gust * (1.0 - decay) + self.gust_m_s * draws[7:10] * math.sqrt(
-                2.0 * decay
-            )
+            pushes_m_s = times(times(draws[7:10], self.gust_m_s), math.sqrt(2.0 * decay))
+            self._gust_m_s = plus(times(self._gust_m_s, 1.0 - decay), pushes_m_s)
 
     def _watch_sensors(self) -> None:
         if self.dead_sensors or self._dead_since_s:
@@ -791,14 +807,14 @@ class Px4Vehicle:
         return FENCE_ACTIONS.get(int(self.parameters["GF_ACTION"]), FailsafeAction.NONE)
 
     def _is_outside_fence(self) -> bool:
-        estimate_m = self.estimated_position_m
+        estimate_m = self._estimated_m()
         if self.home_m is not None:
-            north_m, east_m, down_m = (estimate_m - self.home_m).tolist()
+            north_m, east_m, down_m = minus(estimate_m, self.home_m)
             radius_m = self.parameters["GF_MAX_HOR_DIST"]
             height_m = self.parameters["GF_MAX_VER_DIST"]
             if 0.0 < radius_m < math.hypot(north_m, east_m) or 0.0 < height_m < -down_m:
                 return True
-        north_m, east_m, _ = estimate_m.tolist()
+        north_m, east_m, _ = estimate_m
         return any(
             polygon.contains(self._world, north_m, east_m) != polygon.inclusion
             for polygon in self.fence
@@ -811,8 +827,8 @@ class Px4Vehicle:
     # Motion
 
     def _home_down_m(self) -> float:
-        home_m = self.estimated_position_m if self.home_m is None else self.home_m
-        return float(home_m[2])
+        home_m = self._estimated_m() if self.home_m is None else self.home_m
+        return home_m[2]
 
     def _move(self, dt_s: float) -> None:
         if not self.armed:
@@ -821,14 +837,14 @@ class Px4Vehicle:
             return
         command, yaw_rad, lag_s = self._command()
         to_north, to_east, to_down = self._limit(command)
-        on_ground = self.position_m[2] >= 0.0
+        on_ground = self._position_m[2] >= 0.0
         if on_ground and to_down >= 0.0:
             to_north = to_east = to_down = 0.0
         parameters = self.parameters
         # Level, it is the air that slows it, whatever it takes its velocity to be.
         is_level = self.mode is Px4Mode.DESCEND
-        error_m_s = np.zeros(3) if is_level else self._velocity_error_m_s
-        v_north, v_east, v_down = (self.velocity_m_s + error_m_s).tolist()
+        error_m_s = ZERO if is_level else self._velocity_error_m_s
+        v_north, v_east, v_down = plus(self._velocity_m_s, error_m_s)
         north, east = _shorten(
             (to_north - v_north) / lag_s, (to_east - v_east) / lag_s, parameters["MPC_ACC_HOR"]
         )
@@ -836,17 +852,16 @@ class Px4Vehicle:
             # It takes its nose to be where it is not, and so pushes the wrong way.
             cos, sin = math.cos(self._compass_rad), math.sin(self._compass_rad)
             north, east = cos * north + sin * east, cos * east - sin * north
-        down = self._lift(to_down, v_down)
-        acceleration = np.array([north, east, down])
-        unmet_m_s = self.air_m_s - self.compensated_wind_m_s
+        acceleration = north, east, self._lift(to_down, v_down)
+        unmet_m_s = minus(self._air_m_s, self._compensated_wind_m_s)
         if not on_ground:
             # However slowly it follows a command, it holds against a push as ever.
-            acceleration += unmet_m_s * (DRAG_PER_S * self._airframe.lag_s / lag_s)
-        self.compensated_wind_m_s = self.compensated_wind_m_s + unmet_m_s * (
-            dt_s / WIND_COMPENSATION_S
-        )
+            pushed = times(unmet_m_s, DRAG_PER_S * self._airframe.lag_s / lag_s)
+            acceleration = plus(acceleration, pushed)
+        makes_up_m_s = times(unmet_m_s, dt_s / WIND_COMPENSATION_S)
+        self._compensated_wind_m_s = plus(self._compensated_wind_m_s, makes_up_m_s)
         self.acceleration_m_s2 = acceleration
-        self.velocity_m_s = self.velocity_m_s + acceleration * dt_s
+        self._velocity_m_s = plus(self._velocity_m_s, times(acceleration, dt_s))
         self._turn(yaw_rad, dt_s)
         self._advance(dt_s)
 
@@ -860,7 +875,7 @@ class Px4Vehicle:
             parameters["MPC_ACC_DOWN_MAX"],
         )
         full_lift = power * GREATEST_LIFT_M_S2
-        stands = self.position_m[2] >= 0.0 and self._lift_began_s is None
+        stands = self._position_m[2] >= 0.0 and self._lift_began_s is None
         wanted_lift = 0.0 if stands else GRAVITY_M_S2 - wanted
         self.thrust = min(wanted_lift / max(full_lift, 1e-9), 1.0)
         # A vehicle that lifts too little sinks, against the air's drag.
@@ -868,18 +883,17 @@ class Px4Vehicle:
 
     def _fall(self, dt_s: float) -> None:
         self.yaw_rate_rad_s = 0.0
-        if self.position_m[2] >= 0.0:
-            self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
+        if self._position_m[2] >= 0.0:
+            self._velocity_m_s = self.acceleration_m_s2 = ZERO
             return
-        self.acceleration_m_s2 = np.array([0.0, 0.0, GRAVITY_M_S2])
-        self.velocity_m_s = self.velocity_m_s + self.acceleration_m_s2 * dt_s
+        self.acceleration_m_s2 = (0.0, 0.0, GRAVITY_M_S2)
+        self._velocity_m_s = plus(self._velocity_m_s, times(self.acceleration_m_s2, dt_s))
         self._advance(dt_s)
 
     def _advance(self, dt_s: float) -> None:
-        self.position_m = self.position_m + self.velocity_m_s * dt_s
-        if self.position_m[2] >= 0.0:
-            self.position_m[2] = 0.0
-            self.velocity_m_s = np.zeros(3)
+        self._position_m = plus(self._position_m, times(self._velocity_m_s, dt_s))
+        if self._position_m[2] >= 0.0:
+            self._position_m, self._velocity_m_s = level(self._position_m), ZERO
 
     def _turn(self, yaw_rad: float, dt_s: float) -> None:
         if math.isnan(yaw_rad):
@@ -889,17 +903,17 @@ class Px4Vehicle:
         self.yaw_rate_rad_s = min(max(error_rad / dt_s, -YAW_RATE_RAD_S), YAW_RATE_RAD_S)
         self.heading_rad = (self.heading_rad + self.yaw_rate_rad_s * dt_s) % math.tau
 
-    def _limit(self, command: _Vector) -> _Vector:
+    def _limit(self, command: Vector) -> Vector:
         """The vehicle's own speed limits, the ramp of a takeoff, and what the wind leaves."""
         parameters = self.parameters
         north, east = _shorten(command[0], command[1], parameters["MPC_XY_VEL_MAX"])
-        wind_north, wind_east, _ = self.air_m_s.tolist()
+        wind_north, wind_east, _ = self._air_m_s
         north, east = _shorten(
             north - wind_north, east - wind_east, self._airframe.max_airspeed_m_s
         )
         down = max(command[2], -parameters["MPC_Z_VEL_MAX_UP"])
         down = down * self._ramp() if down < 0.0 else min(down, parameters["MPC_Z_VEL_MAX_DN"])
-        if self.position_m[2] < 0.0:
+        if self._position_m[2] < 0.0:
             return north + wind_north, east + wind_east, down
         # The first command upwards after spool-up starts the ramp.
         spooled = self.time_s - self._armed_at_s >= parameters["COM_SPOOLUP_TIME"]
@@ -911,16 +925,16 @@ class Px4Vehicle:
 
     def _ramp(self) -> float:
         if self._lift_began_s is None:
-            return 0.0 if self.position_m[2] >= 0.0 else 1.0
+            return 0.0 if self._position_m[2] >= 0.0 else 1.0
         ramp_s = self.parameters["MPC_TKO_RAMP_T"]
         return min(1.0, (self.time_s - self._lift_began_s) / ramp_s) if ramp_s > 0.0 else 1.0
 
-    def _command(self) -> tuple[_Vector, float, float]:
+    def _command(self) -> tuple[Vector, float, float]:
         """Velocity, world frame, m/s; yaw, rad or NaN; horizontal lag, s."""
         lag_s = self._airframe.lag_s
         if self.landed and self.mode not in CAN_LEAVE_GROUND:
-            return _STILL, math.nan, lag_s
-        wind_north, wind_east, _ = self.air_m_s.tolist()
+            return ZERO, math.nan, lag_s
+        wind_north, wind_east, _ = self._air_m_s
         if self.mode is Px4Mode.DESCEND:
             # Level, it is carried along by the air as fast as that drags it.
             descent = wind_north, wind_east, self.parameters["MPC_LAND_SPEED"]
@@ -933,17 +947,17 @@ class Px4Vehicle:
             return self._descend(), math.nan, lag_s
         if self.mode is Px4Mode.RETURN:
             return self._return(), math.nan, lag_s
-        if self.mode in PILOTED and self._sticks_m_s.any():
-            north, east, down = self._sticks_m_s.tolist()
-            return (north, east, down), math.nan, lag_s
+        if self.mode in PILOTED and any(self._sticks_m_s):
+            return self._sticks_m_s, math.nan, lag_s
         if self.mode in PILOTED and self.mode is not Px4Mode.POSCTL:
             return (wind_north, wind_east, 0.0), math.nan, lag_s
         return self._hold(), math.nan, lag_s
 
-    def _follow(self, setpoint: Px4Setpoint) -> tuple[_Vector, float, float]:
+    def _follow(self, setpoint: Px4Setpoint) -> tuple[Vector, float, float]:
         parameters = self.parameters
         gain, gain_down = parameters["MPC_XY_P"], parameters["MPC_Z_P"]
-        off_north, off_east, off_down = (setpoint.position_m - self.local_position_m).tolist()
+        here_m = minus(self._estimated_m(), self.estimator_origin_m.tolist())
+        off_north, off_east, off_down = minus(setpoint.position_m.tolist(), here_m)
         to_north, to_east, to_down = setpoint.velocity_m_s.tolist()
         north, east = _shorten(
             _axis(to_north, off_north, gain, 0.0),
@@ -956,35 +970,35 @@ class Px4Vehicle:
         lag_s = airframe.offboard_velocity_lag_s if bare_velocity else airframe.lag_s
         return (north, east, down), setpoint.yaw_rad, lag_s
 
-    def _hold(self) -> _Vector:
+    def _hold(self) -> Vector:
         """Brake, then stay where the vehicle came to rest."""
         if self._hold_m is None:
-            north, east, _ = (self.velocity_m_s + self._velocity_error_m_s).tolist()
+            north, east, _ = plus(self._velocity_m_s, self._velocity_error_m_s)
             if math.hypot(north, east) > STOPPED_M_S:
-                return _STILL
-            self._hold_m = self.estimated_position_m
+                return ZERO
+            self._hold_m = self._estimated_m()
         return self._toward(self._hold_m)
 
-    def _climb(self) -> _Vector:
+    def _climb(self) -> Vector:
         north, east, _ = self._hold()
-        error_m = float(self.estimated_position_m[2]) - self._takeoff_down_m
+        error_m = self._estimated_m()[2] - self._takeoff_down_m
         if error_m < ARRIVED_M and self._took_off:
             self._set_intended_mode(Px4Mode.HOLD)
         speed_m_s = min(error_m * self.parameters["MPC_Z_P"], self.parameters["MPC_TKO_SPEED"])
         return north, east, -speed_m_s
 
-    def _descend(self) -> _Vector:
+    def _descend(self) -> Vector:
         north, east, _ = self._hold()
-        return north, east, self._descent_m_s(-float(self.position_m[2]))
+        return north, east, self._descent_m_s(-self._position_m[2])
 
     def _descent_m_s(self, height_m: float) -> float:
         near = height_m < SLOW_DESCENT_BELOW_M
         return self.parameters["MPC_LAND_SPEED" if near else "MPC_Z_VEL_MAX_DN"]
 
-    def _return(self) -> _Vector:
+    def _return(self) -> Vector:
         """Climb to the return altitude, fly home, land."""
         assert self.home_m is not None
-        off_north_m, off_east_m, height_m = (self.home_m - self.estimated_position_m).tolist()
+        off_north_m, off_east_m, height_m = minus(self.home_m, self._estimated_m())
         if math.hypot(off_north_m, off_east_m) < 1.0:
             north, east, _ = self._toward(self.home_m)
             return north, east, self._descent_m_s(height_m)
@@ -995,8 +1009,8 @@ class Px4Vehicle:
         north, east, _ = self._toward(self.home_m)
         return north, east, 0.0
 
-    def _toward(self, target_m: F64) -> _Vector:
-        off_north, off_east, off_down = (target_m - self.estimated_position_m).tolist()
+    def _toward(self, target_m: Vector) -> Vector:
+        off_north, off_east, off_down = minus(target_m, self._estimated_m())
         gain, gain_down = self.parameters["MPC_XY_P"], self.parameters["MPC_Z_P"]
         north, east = _shorten(gain * off_north, gain * off_east, self.parameters["MPC_XY_CRUISE"])
         return north, east, gain_down * off_down
@@ -1004,7 +1018,7 @@ class Px4Vehicle:
     # Ground
 
     def _watch_ground(self) -> None:
-        if self.position_m[2] < 0.0:
+        if self._position_m[2] < 0.0:
             self._on_ground_since_s = math.inf
             self._off_ground_since_s = min(self._off_ground_since_s, self.time_s)
             if self.time_s - self._off_ground_since_s < IN_AIR_AFTER_S:
@@ -1036,19 +1050,17 @@ class Px4Vehicle:
             self.disarm(reason=_BEFORE_FLIGHT)
 
     def _record_truth(self) -> None:
-        north_m, east_m, down_m = self.position_m.tolist()
-        v_north, v_east, v_down = self.velocity_m_s.tolist()
         self.truth.append(
             Truth(
                 self.time_s,
-                (north_m, east_m, down_m),
-                (v_north, v_east, v_down),
+                self._position_m,
+                self._velocity_m_s,
                 self.mode,
                 self.armed,
                 self.landed,
                 self._setpoint_at_s,
                 self._follows(),
-                math.hypot(*self._velocity_error_m_s[:2].tolist()),
+                math.hypot(*self._velocity_error_m_s[:2]),
                 self.commands,
             )
         )

@@ -1,21 +1,22 @@
 """Where the simulated world lies on the earth, and polygons on it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from typing import NamedTuple
 
 from edge.core import F64
 
 
-@dataclass(frozen=True, slots=True)
-class WorldOrigin:
+class WorldOrigin(NamedTuple):
     """Where the world frame lies: WGS84 degrees, and the ground's height above mean sea level."""
 
     latitude_deg: float = 39.9526
     longitude_deg: float = -75.1652
     altitude_m: float = 10.0
 
-    def to_global(self, position_m: F64) -> tuple[float, float, float]:
+    def to_global(self, position_m: Sequence[float] | F64) -> tuple[float, float, float]:
         """Latitude and longitude, deg, and height above mean sea level, m, of a world position."""
         north_m, east_m = _m_per_deg(self.latitude_deg)
         return (

@@ -14,6 +14,7 @@ import pytest
 
 from lpac.fleet.cards import open_authority
 from lpac.fleet.settings import load_fleet
+from lpac.sim.hosts.hosts import SimulatedHosts
 from lpac.sim.hosts.rack import children
 from lpac.sim.px4.modes import Px4Mode
 from tests.host.fleet.field import (
@@ -25,13 +26,12 @@ from tests.host.fleet.field import (
     lpac_fleet,
     running_lpac_fleet,
 )
-from tests.host.hosts import FrailHosts
 
 
 class Operator:
     """Types commands for one fleet."""
 
-    def __init__(self, hosts: FrailHosts) -> None:
+    def __init__(self, hosts: SimulatedHosts) -> None:
         self.hosts = hosts
         self.fleet_toml = hosts.fleet_toml
 

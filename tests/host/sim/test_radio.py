@@ -8,7 +8,6 @@ import json
 import math
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -91,7 +90,7 @@ def _fly(folder: Path) -> None:
             with rig.simulated.stepped:
                 entries = [e for e in rig.vehicle(robot).truth if e.time_s > began_s[robot]]
             flight = {
-                "truth": [asdict(e) | {"after_s": e.time_s - began_s[robot]} for e in entries],
+                "truth": [e._asdict() | {"after_s": e.time_s - began_s[robot]} for e in entries],
                 "behind_s": fleet.vehicles.lost_s() - lost_s,
             }
             (folder / f"{robot}.json").write_text(json.dumps(flight))

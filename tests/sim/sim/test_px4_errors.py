@@ -96,7 +96,7 @@ def test_gusts_are_the_same_for_all_and_reach_their_greatest(seed: int, fleet: i
     assert max(speeds_m_s) == pytest.approx(GREATEST_WIND_M_S, abs=0.1)
     assert min(speeds_m_s) < 4.1
     assert max(abs(b - a) for a, b in pairwise(speeds_m_s)) < 0.5
-    assert (errors.wind_m_s(17.0) == other.wind_m_s(17.0)).all()
+    assert errors.wind_m_s(17.0) == other.wind_m_s(17.0)
 
 
 def test_a_compass_errs_and_is_reset_in_flight() -> None:

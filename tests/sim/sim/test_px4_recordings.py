@@ -357,7 +357,9 @@ def run(
             todo.pop()[1](vehicle)
         if not vehicle.landed and vehicle.position_m[2] >= -0.1:
             # On its way down; see ON_PURPOSE.
-            vehicle.position_m[2] = -0.1 if vehicle.time_s < down_s else 0.0
+            north_m, east_m, _ = vehicle.position_m
+            down_m = -0.1 if vehicle.time_s < down_s else 0.0
+            vehicle.position_m = np.array([north_m, east_m, down_m])
         vehicle.step(STEP_S)
         for datagram in link.due():
             said += ears.hear(vehicle.time_s, datagram)

@@ -31,7 +31,6 @@ BUNDLE_ID = hashlib.sha256(b"manifest").digest()
 OTHER_BUNDLE_ID = hashlib.sha256(b"another manifest").digest()
 HEADER_SIZE = 104
 FRAME_ID = 0x0A0B0C0D
-OWN_ID = 9
 FLOAT16_MAX = 65504.0
 COMPRESSED = 0x40
 TYPES = pytest.mark.parametrize("payload_type", PAYLOAD_TYPES)
@@ -51,7 +50,7 @@ MESSAGE = AggregatedMessage(
 def messages(payload: st.SearchStrategy[F32]) -> st.SearchStrategy[AggregatedMessage]:
     return st.builds(
         AggregatedMessage,
-        robot_id=st.integers(0, 2**16 - 1).filter(lambda robot_id: robot_id != OWN_ID),
+        robot_id=st.integers(0, 2**16 - 1),
         boot_epoch=st.integers(0, 2**43 - 1),
         sequence=st.integers(0, 2**32 - 1),
         sent=st.none()
@@ -77,7 +76,6 @@ def receive(
     *,
     message_size: int = MESSAGE.payload.size,
     bundle_id: bytes = BUNDLE_ID,
-    own_robot_id: int = OWN_ID,
     payload_limit: float | None = None,
     shared_side: int = 0,
 ) -> AggregatedMessage | Rejection:
@@ -85,7 +83,6 @@ def receive(
         data,
         bundle_id=bundle_id,
         frame_id=FRAME_ID,
-        own_robot_id=own_robot_id,
         message_size=message_size,
         payload_limit=payload_limit,
         shared_side=shared_side,
@@ -207,7 +204,7 @@ def test_on_the_ground_a_message_is_as_large_as_in_flight(payload_type: PayloadT
         arrived, in_flight = (
             decode(
                 encode(message, BUNDLE_ID, payload_type, as_in_flight=as_in_flight),
-                bundle_id=BUNDLE_ID, frame_id=FRAME_ID, own_robot_id=OWN_ID, message_size=870,
+                bundle_id=BUNDLE_ID, frame_id=FRAME_ID, message_size=870,
                 shared_side=32,
             )
             for as_in_flight in (True, False)
@@ -406,11 +403,8 @@ def test_the_reason_is_the_most_telling_one() -> None:
         Rejection.VERSION: good[:8] + b"\2" + good[9:70],
         Rejection.PAYLOAD_TYPE: good[:9] + b"\4" + good[10:],
         Rejection.CHECKSUM: good[:-1] + b"\x7f",
-        # Another bundle's payload may have any length; its robots' ids are not ours.
-        Rejection.OTHER_BUNDLE: encode(
-            dataclasses.replace(longer, robot_id=OWN_ID), OTHER_BUNDLE_ID, "float16"
-        ),
-        Rejection.OWN: encode(dataclasses.replace(MESSAGE, robot_id=OWN_ID), BUNDLE_ID, "float16"),
+        # Another bundle's payload may have any length.
+        Rejection.OTHER_BUNDLE: encode(longer, OTHER_BUNDLE_ID, "float16"),
         Rejection.PAYLOAD_LENGTH: encode(longer, BUNDLE_ID, "float32"),
         Rejection.OTHER_FRAME: encode(
             dataclasses.replace(MESSAGE, frame_id=FRAME_ID + 1), BUNDLE_ID, "float32"

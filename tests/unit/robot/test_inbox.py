@@ -213,7 +213,7 @@ def test_whom_the_ground_hears_and_this_robot_does_not() -> None:
             beacon = dataclasses.replace(NEIGHBOUR, robot_id=2, sequence=int(now_s * 10.0))
             inbox.put_beacon(beacon, now_s)
         inbox.peers(now_s)
-        return inbox.unheard
+        return inbox.unheard(now_s)
 
     # Its program has only just begun.
     assert [unheard(now_s, 2, 3) for now_s in (1.0, 2.0, 4.0, 5.9)] == [()] * 4

@@ -177,7 +177,6 @@ def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
                 sent.message,
                 bundle_id=shipped_policy.bundle_id,
                 frame_id=0,
-                own_robot_id=9,
                 message_size=870,
             )
         )
@@ -189,7 +188,7 @@ def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"max_speed_m_s": float("nan")}, "max_speed_m_s = nan: must be above 0 and finite"),
+        ({"max_speed_m_s": float("nan")}, "max_speed_m_s = nan: must be positive and finite"),
         ({"max_input_age_s": -1.0}, "max_input_age_s = -1.0"),
         ({"payload": "float64"}, "payload = 'float64'"),
     ],
@@ -244,9 +243,10 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
 def test_what_a_robot_must_not_hear_is_counted(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     good = message(shipped_policy)
+    # Another bundle's robots' ids are not ours.
     other = encode(
         AggregatedMessage(
-            3, 1, 1, None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, fill(shipped_policy, 0.0)
+            1, 1, 1, None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, fill(shipped_policy, 0.0)
         ),
         bytes(32),
         "float32",

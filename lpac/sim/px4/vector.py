@@ -1,0 +1,37 @@
+"""Vectors of three as plain floats: a quarter of the time that numpy's arrays of three take.
+
+The results are those of numpy's element-wise operations, to the last bit.
+"""
+
+from collections.abc import Sequence
+
+from edge.core import F64
+from edge.core.vehicle import Vector
+
+ZERO: Vector = (0.0, 0.0, 0.0)
+
+
+def vector(array: F64) -> Vector:
+    """The three numbers of an array (3,)."""
+    x, y, z = array.tolist()
+    return x, y, z
+
+
+def plus(a: Sequence[float], b: Sequence[float]) -> Vector:
+    """a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def minus(a: Sequence[float], b: Sequence[float]) -> Vector:
+    """a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def times(a: Sequence[float], factor: float) -> Vector:
+    """a * factor."""
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+def level(a: Sequence[float]) -> Vector:
+    """What of it lies in the plane."""
+    return a[0], a[1], 0.0
