@@ -65,7 +65,9 @@ _INTERFACES = {
     },
     "What all of them use": {
         "edge.core": "F32 F64 Bools",
-        "edge.core.schema": "from_mapping ConfigError",
+        "edge.core.schema": (
+            "from_mapping ConfigError Bounded Positive NonNegative AtLeastOne Share"
+        ),
     },
     "A figure": {"lpac.analysis": "style"},
 }

@@ -6,31 +6,30 @@ the mission frame's x axis, its rows against the y axis: the top of the image is
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from edge.core import F32, F64, Bools
 from edge.core.perception import window_corner
+from edge.core.schema import Bounded
+
+Pixels = Annotated[int, Meta(ge=8, le=4096)]
+FieldOfView = Annotated[float, Meta(ge=1.0, le=170.0)]
 
 
 @dataclass(frozen=True, slots=True)
-class Pinhole:
+class Pinhole(Bounded):
     """A camera without distortion, its pixels square.
 
     Raises ValueError that names the number for an impossible one.
     """
 
-    columns: int = 120
-    rows: int = 90
-    field_of_view_deg: float = 40.0  # across the columns
-
-    def __post_init__(self) -> None:
-        for name in ("columns", "rows"):
-            if not 8 <= getattr(self, name) <= 4096:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be from 8 to 4096")
-        if not 1.0 <= self.field_of_view_deg <= 170.0:
-            raise ValueError(f"field_of_view_deg = {self.field_of_view_deg}: must be from 1 to 170")
+    columns: Pixels = 120
+    rows: Pixels = 90
+    field_of_view_deg: FieldOfView = 40.0  # across the columns
 
     def pixel(self, height: float) -> float:
         """How long a pixel is on the ground, seen from `height` above it."""

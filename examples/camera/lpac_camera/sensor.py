@@ -3,35 +3,32 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from edge.core import F64
 from edge.core.perception import part_in_world, window_corner
 from edge.core.ports import Look, SensorOver, SensorSetting
-from edge.core.schema import from_mapping
+from edge.core.schema import Bounded, from_mapping
 from lpac_camera.detector import MARGIN, Detector
 from lpac_camera.ground import Ground, ground_of
-from lpac_camera.pinhole import Pinhole, onto_cells, smoothed
+from lpac_camera.pinhole import FieldOfView, Pinhole, Pixels, onto_cells, smoothed
 
 
 @dataclass(frozen=True, slots=True)
-class CameraOptions:
+class CameraOptions(Bounded):
     """`[sensor.options]` of robot.toml; `smoothing` is how many cells wide means are taken.
 
     Raises ValueError that names the option for an impossible value.
     """
 
-    field_of_view_deg: float = 40.0
-    columns: int = 120
-    rows: int = 90
-    smoothing: int = 17
-
-    def __post_init__(self) -> None:
-        self.pinhole()
-        if not 1 <= self.smoothing <= 201:
-            raise ValueError(f"smoothing = {self.smoothing}: must be from 1 to 201")
+    field_of_view_deg: FieldOfView = 40.0
+    columns: Pixels = 120
+    rows: Pixels = 90
+    smoothing: Annotated[int, Meta(ge=1, le=201)] = 17
 
     def pinhole(self) -> Pinhole:
         """The camera that this describes."""

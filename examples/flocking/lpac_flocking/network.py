@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from edge.core import F32
-from edge.core.schema import from_mapping
+from edge.core.schema import AtLeastOne, Bounded, from_mapping
 from edge.policy.bundle import SCHEMA_VERSION, Bundle, Manifest, make_bundle
 from edge.policy.family import verified
 from export.parameters import PolicyParameters
@@ -23,16 +23,11 @@ _GOLDEN_ROBOTS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlockingNetwork:
+class FlockingNetwork(Bounded):
     """Sizes: K = `hops` of neighbours' features, `width` of the layer and of the MLP."""
 
-    hops: int = 3
-    width: int = 64
-
-    def __post_init__(self) -> None:
-        for name in ("hops", "width"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be at least 1")
+    hops: AtLeastOne = 3
+    width: AtLeastOne = 64
 
     @property
     def task(self) -> FlockingTask:
