@@ -18,15 +18,9 @@ BENCHES = (
     "scaling",
     "simulated",
     "closed_loop",
-    "payloads",
     "usual",
-    "stolen_key",
-    "flood",
     "hearing",
     "loops",
-    "release",
-    "position",
-    "command",
 )
 
 

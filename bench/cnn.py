@@ -13,7 +13,7 @@ import onnx
 import onnxruntime as ort
 from onnx import TensorProto, helper, shape_inference
 
-from bench.report import Table
+from bench.result import Table
 from bench.timing import interleaved, quartiles, with_quartiles
 from edge.core import F32
 from edge.policy.bundle import Bundle

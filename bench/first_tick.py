@@ -1,9 +1,10 @@
 """What a robot's policy process tells `footprint` about itself, ours and torch's alike."""
 
 import json
+import os
 from collections.abc import Callable
 
-from bench.memory import memory_mb
+from bench.usage import usage
 
 TICKED = "ticked\n"
 TICKS = 20
@@ -20,4 +21,5 @@ def run(tick: Callable[[], object]) -> None:
     print(TICKED, end="", flush=True)
     for _ in range(TICKS - 1):
         tick()
-    print(json.dumps(memory_mb()), flush=True)
+    taken = usage(os.getpid())
+    print(json.dumps({"rss": taken.resident_mb, "private": taken.private_mb}), flush=True)

@@ -9,14 +9,14 @@ from typing import Any
 
 from bench import ROOT
 from bench.first_tick import TICKED, TICKS
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from bench.timing import quartiles, with_quartiles
 
 EDGE, TORCH = "edge", "torch"
 _NAMES = {EDGE: "lpac-edge", TORCH: "torch + PyG"}
 
 
-def measure(runs: int = 3) -> Report:
+def measure(runs: int = 3) -> Result:
     """Processes of their own, in turn; one of each before, so that files come from the cache."""
     processes: dict[str, list[dict[str, float]]] = {EDGE: [], TORCH: []}
     for run in range(runs + 1):
@@ -39,7 +39,7 @@ def measure(runs: int = 3) -> Report:
         )
         for key in keys
     }
-    units = {"first_tick_s": "first tick, s", "rss": "RSS, MB", "pss": "PSS, MB"}
+    units = {"first_tick_s": "first tick, s", "rss": "RSS, MB", "private": "private, MB"}
     rows = [
         (
             units[key],
@@ -49,7 +49,7 @@ def measure(runs: int = 3) -> Report:
         for key in keys
     ]
     ratios = figures["edge_over_torch"]
-    return Report(
+    return Result(
         "footprint",
         figures,
         [Table("A robot's policy process", ("", *_NAMES.values(), "ratio"), rows)],

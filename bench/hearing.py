@@ -21,8 +21,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from bench import BUNDLE
-from bench.report import Report, Table, Target, progress
-from bench.stolen_key import ready_fleet
+from bench.result import Result, Table, Target, progress
 from edge.core.aggregation import AggregatedMessage
 from edge.core.logger import show
 from edge.core.wire import PayloadType, decode, encode, payload_type_of
@@ -36,15 +35,17 @@ from edge.identity.news import MessageNumber
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon
 from edge.messages.topics import MESSAGE, Group, Link, Topic
 from edge.policy.bundle import load_bundle
-from lpac.ground.station.protocol import Start, Takeoff
+from lpac.ground.station.protocol import Enable, SetOrigin, Start, Takeoff
+from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.members import SimulatedMembers
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.ports import free_ports
+from lpac.sim.scenario import Scenario
 
 _FLEET, _SEED = "simulated", 1
 _KEY = b"h" * 32
-# By when robots of the simulated flight have seen something, and how long until the others know
-# that somebody is there, s.
+# After each command robots of the simulated flight are ready for the next, and have seen something
+# after the last; and how long until the others know that somebody is there, s.
 _FLOWN_S, _WARM_UP_S = 15.0, 3.0
 # Programs that began after those of the flight.
 _START = int(1e3 * (EPOCH_S + 3600.0))
@@ -62,7 +63,7 @@ class Heard:
 
 def measure(
     others: tuple[int, ...] = (0, 9, 99), seconds: float = 20.0, robots: int = 10
-) -> Report:
+) -> Result:
     """Each number of others in turn; they say what so many robots of a flight said."""
     heard: list[Heard] = []
     for count in others:
@@ -81,7 +82,7 @@ def measure(
                 f"{each.cpu_percent:.2f}", f"{cost_us:.0f}" if each.messages_hz else "",
             )
         )  # fmt: skip
-    return Report(
+    return Result(
         "hearing",
         {str(each.others): asdict(each) for each in heard},
         [
@@ -106,7 +107,9 @@ def _hear(others: int, seconds: float, robots: int) -> Heard:
     port, zenoh_port = free_ports(2)
     group = Group("239.255.76.90", port, "127.0.0.1", (_KEY,), is_secret=True)
     with tempfile.TemporaryDirectory() as folder:
-        fleet = ready_fleet(robots, _SEED, Path(folder))
+        fleet = SimulatedFleet(
+            Scenario(robots=robots, seed=_SEED, secure=True), Path(folder), BUNDLE
+        )
         said = _messages_of(fleet)
         node = fleet.robots[0].node
         assert node is not None
@@ -159,11 +162,12 @@ def _messages_of(fleet: SimulatedFleet) -> "list[_Said]":
         Role.ROBOT, "listener", listener, _START, fleet.schedule.monotonic_s
     )
     fleet.radio.link(listener, guard.subscriptions({MESSAGE: hear}))
-    for request in (Takeoff(), Start()):
+    fleet.schedule.run_until(_FLOWN_S)
+    for request in (SetOrigin(ORIGIN), Enable(), Takeoff(), Start()):
         report = fleet.ground.command(request)
         if not report.done:
             raise RuntimeError(f"the flight did not go as planned: {report}")
-    fleet.schedule.run_until(fleet.ground.now_s + _FLOWN_S)
+        fleet.schedule.run_until(fleet.ground.now_s + _FLOWN_S)
     return said[-listener:]
 
 

@@ -19,7 +19,7 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from bench import BUNDLE
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from bench.usage import Usage, usage
 from edge.messages.mission import LoopStatus
 from lpac.analysis.logs import LoggedStatus
@@ -55,7 +55,7 @@ class _Flight(NamedTuple):
     taken: list[_Taken]
 
 
-def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = True) -> Report:
+def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = True) -> Result:
     """A flight of so many robots; and with `beside_busy` one of a single robot."""
     progress(f"loops: {robots} robots fly, about two minutes")
     crowd = _fly(robots, mission_s)
@@ -92,7 +92,7 @@ def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = Tr
         "processor, % of a core, that keys cost": (cpu["with keys"] - cpu["plain"], 1.0),
         "private memory, MB, that keys cost": (private["with keys"] - private["plain"], 8.0),
     }
-    return Report(
+    return Result(
         "loops",
         figures,
         [

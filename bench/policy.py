@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from bench import BUNDLE, CHECKPOINT, cnn
 from bench.moment import NEIGHBOURS, Moment, moment_in_flight
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from bench.timing import interleaved, quartiles, with_quartiles
 from bench.torch_robot import Network, PygLayer, TapLayer, TorchRobot, exchange_inputs, load_network
 from edge.core import F32
@@ -31,7 +31,7 @@ TOLERANCE = 1e-4
 Outputs = tuple[F32, F32]
 
 
-def measure(rounds: int = 200, round_s: float = 0.01) -> Report:
+def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
     """Whole tick, graph neural network alone, the parts of our tick, and the CNN's efficiency.
 
     Raises RuntimeError if the variants' outputs differ by more than TOLERANCE.
@@ -70,7 +70,7 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Report:
     progress("policy: CNN")
     figures["cnn"] = cnn.measure(bundle, robot.images, rounds // 2, round_s)
     tables.append(cnn.table(figures["cnn"]))
-    return Report(
+    return Result(
         "policy",
         figures,
         tables,

@@ -1,7 +1,8 @@
-"""The simulators of points with more and more robots at constant density, and the reference's."""
+"""The simulators of points with more and more robots at constant density."""
 
 import gc
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
@@ -9,36 +10,32 @@ from multiprocessing import get_context
 from time import perf_counter, process_time
 from typing import Any
 
-from bench import BUNDLE, CHECKPOINT
-from bench.memory import memory_mb
-from bench.reference_swarm import ReferenceSwarm, is_installed
-from bench.report import Report, Table, Target, progress
+from bench import BUNDLE
+from bench.result import Result, Table, Target, progress
+from bench.usage import usage
 from edge.core import F32, F64
 from edge.core.coverage import coverage_cost
-from edge.core.world import GaussianFeature
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.sim.batch import BatchedFlights
-from lpac.sim.experiment import SAMPLE_S, SAMPLES_PER_COST, prepare
+from lpac.sim.experiment import SAMPLE_S, SAMPLES_PER_COST
 from lpac.sim.experiment import fly as fly_exactly
 from lpac.sim.scenario import Scenario
 
-EXACT, BATCHED, REFERENCE = "exact", "batched", "CoverageControl"
-TWO_THREADS = "batched, 2 threads"
+EXACT, BATCHED, TWO_THREADS = "exact", "batched", "batched, 2 threads"
 # Of training: ten robots and ten features in one world.
 _ROBOTS_PER_WORLD = 10
 # (robots, simulated seconds, flights)
 _FLIGHTS = ((10, 30.0, 3), (100, 6.0, 3), (1000, 2.0, 1))
 # Robots see more of the world the longer they fly, so all are weighed at the same age.
 _MEMORY_AT_S = 2.0
-# The reference takes ten megabytes a robot and more, the larger the world; and beyond it a second
-# thread finds something to do.
-_MOST_REFERENCE_ROBOTS = 100
+# Up to so many robots a second thread finds nothing to do.
+_ONE_THREAD_ROBOTS = 100
 
 # Called with the simulated time, from 0 to the flight's end.
 Note = Callable[[float], None]
 
 
-def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Report:
+def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Result:
     """Flights in processes of their own, one at a time; `flights` are robots, seconds, repeats."""
     figures: dict[str, dict[str, Any]] = {}
     with ProcessPoolExecutor(
@@ -74,18 +71,16 @@ def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Report:
         "robots", "simulator", "world", "simulated, s", "x real time", "CPU ms per robot and s",
         f"MB per robot at {_MEMORY_AT_S:g} s", "cost J's share",
     )  # fmt: skip
-    return Report(
+    return Result(
         "scaling",
         figures,
         [Table("Simulators of points at constant density", columns, rows)],
         list(_targets(figures)),
         [
-            "One core each, but for two threads. Field scale (CoverageControl: its own, in which "
-            "robots move a quarter as far); the world's area and its features grow with the "
-            "robots. Of several flights the median by processor time. Times leave out making the "
-            "world, but include the coverage cost J once a second; memory includes the world's "
-            "raster, but not the program. CoverageControl's simulator with its LPAC in batched "
-            "torch, which all robots ask at once, five times a second."
+            "One core each, but for two threads. Field scale; the world's area and its features "
+            "grow with the robots. Of several flights the median by processor time. Times leave "
+            "out making the world, but include the coverage cost J once a second; memory includes "
+            "the world's raster, but not the program."
         ],
     )
 
@@ -100,9 +95,7 @@ def world_for(bundle: Bundle, robots: int) -> Bundle:
 
 
 def _simulators(robots: int) -> tuple[str, ...]:
-    if robots > _MOST_REFERENCE_ROBOTS:
-        return EXACT, BATCHED, TWO_THREADS
-    return (EXACT, BATCHED, *([REFERENCE] if is_installed() else []))
+    return (EXACT, BATCHED) if robots <= _ONE_THREAD_ROBOTS else (EXACT, BATCHED, TWO_THREADS)
 
 
 def _targets(figures: dict[str, dict[str, Any]]) -> Iterator[Target]:
@@ -115,10 +108,6 @@ def _targets(figures: dict[str, dict[str, Any]]) -> Iterator[Target]:
             factor = of[TWO_THREADS]["real_time_factor"]
             what = f"{robots} robots, {TWO_THREADS}: times real time"
             yield Target(what, factor, 0.6, at_least=True)
-        if REFERENCE in of:
-            share = of[BATCHED]["cpu_ms_per_robot_s"] / of[REFERENCE]["cpu_ms_per_robot_s"]
-            what = f"{robots} robots, {BATCHED}: processor time over {REFERENCE}'s"
-            yield Target(what, share, 0.6, at_least=False)
     memory_mb_per_robot = max(of[BATCHED]["memory_mb_per_robot"] for of in figures.values())
     yield Target(f"{BATCHED}: MB per robot", memory_mb_per_robot, 1.0, at_least=False)
 
@@ -129,7 +118,7 @@ def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dic
     # What the libraries allocate once is not the robots'.
     fly(Scenario(robots=2, duration_s=1.0, random_feature_count=1), world_for(bundle, 2), _no_note)
     gc.freeze()  # as `lpac sim` does
-    empty_mb = memory_mb()["rss"]
+    empty_mb = usage(os.getpid()).resident_mb
     flying_mb = wall_s = cpu_s = 0.0
 
     def note(time_s: float) -> None:
@@ -137,7 +126,7 @@ def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dic
         if time_s == 0.0:
             wall_s, cpu_s = -perf_counter(), -process_time()
         if time_s <= min(_MEMORY_AT_S, duration_s) + SAMPLE_S / 2:
-            flying_mb = memory_mb()["rss"]
+            flying_mb = usage(os.getpid()).resident_mb
         if time_s >= duration_s:
             wall_s, cpu_s = wall_s + perf_counter(), cpu_s + process_time()
 
@@ -187,25 +176,6 @@ def _fly_on(executor: Executor | None, scenario: Scenario, bundle: Bundle, note:
     return _cost_s(scenario, prepared.importance, positions_m)
 
 
-def _fly_reference(scenario: Scenario, bundle: Bundle, note: Note) -> float:
-    prepared = prepare(scenario, bundle)
-    swarm = ReferenceSwarm(
-        bundle.manifest,
-        CHECKPOINT,
-        [each for each in prepared.features if isinstance(each, GaussianFeature)],
-        scenario.scale.position_to_model(prepared.starts_m),
-    )
-    note(0.0)
-    steps = round(scenario.duration_s / swarm.time_step_s)
-    for step in range(1, steps + 1):
-        swarm.step()
-        note(scenario.duration_s if step == steps else step * swarm.time_step_s)
-    start_s = perf_counter()
-    for _ in range(round(scenario.duration_s)):
-        swarm.cost()
-    return perf_counter() - start_s
-
-
 def _cost_s(scenario: Scenario, importance: F32, positions_m: Sequence[F64] | F64) -> float:
     start_s = perf_counter()
     for each_m in positions_m[SAMPLES_PER_COST::SAMPLES_PER_COST]:
@@ -217,5 +187,4 @@ _FLY = {
     EXACT: _fly_exactly,
     BATCHED: _fly_batched,
     TWO_THREADS: _fly_on_two_threads,
-    REFERENCE: _fly_reference,
 }

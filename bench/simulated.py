@@ -8,13 +8,13 @@ from pathlib import Path
 from time import perf_counter, process_time
 
 from bench import BUNDLE
-from bench.report import Report, Table, Target, progress
+from bench.result import Result, Table, Target, progress
 from edge.core.logger import show
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.scenario import Scenario
 
 
-def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Report:
+def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Result:
     """Flights in processes of their own, one at a time: from the pads to the pads."""
     with ProcessPoolExecutor(
         max_workers=1, max_tasks_per_child=1, mp_context=get_context("spawn")
@@ -25,7 +25,7 @@ def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Report:
             flights.append(processes.submit(_fly, robots, mission_s).result())
     flights.sort(key=lambda flight: flight["real_time_factor"])
     median = flights[runs // 2]
-    return Report(
+    return Result(
         "simulated",
         {str(robots): flights},
         [

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import track
 
-from bench.report import Report, Table
+from bench.result import Result, Table
 from edge.policy.bundle import load_bundle
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.cores import over_cores
@@ -36,7 +36,7 @@ class _Ended(NamedTuple):
     ratio: float
 
 
-def measure(points: int = 100, whole: int = 30) -> Report:
+def measure(points: int = 100, whole: int = 30) -> Result:
     """So many worlds each: of ten points, and of each number of whole robots."""
     seeds = range(_FIRST_SEED, _FIRST_SEED + max(points, whole))
     flights = [
@@ -59,7 +59,7 @@ def measure(points: int = 100, whole: int = 30) -> Report:
     }
     USUAL_JSON.write_text(json.dumps(measured, indent=1) + "\n")
     rows = [(kind, *(f"{value:g}" for value in each)) for (kind, _), each in usual.items()]
-    return Report(
+    return Result(
         "usual",
         measured | {"ratios": {f"{kind} {n}": found for (kind, n), found in ratios.items()}},
         [Table("Cost over the clairvoyant's, of 8 flights in 10", ("", *Usual._fields), rows)],

@@ -37,14 +37,14 @@ for name, topics in sorted(logs.items()):
 examined = examine([folder])
 for note in examined.notes:
     print("note:", note)
-trial = examined.trials[0]
-if len(trial.normalized):
-    print(f"{trial.name}: cost at the end {trial.normalized[-1]:.3f} of the initial cost")
-if trial.separation is not None:
-    print(f"{trial.name}: least distance of two robots {trial.separation.distance_m:.2f} m")
+record = examined.records[0]
+if len(record.normalized):
+    print(f"{record.name}: cost at the end {record.normalized[-1]:.3f} of the initial cost")
+if record.separation is not None:
+    print(f"{record.name}: least distance of two robots {record.separation.distance_m:.2f} m")
 figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.0, 4.5), sharex=True, layout="constrained")
-draw_states(upper, trial)
+draw_states(upper, record)
 upper.set_xlabel("")
-draw_heights(lower, trial)
+draw_heights(lower, record)
 figure.savefig("read_logs.png", dpi=150)
 print("see read_logs.png")

@@ -7,16 +7,16 @@ from pathlib import Path
 
 from edge.core.file_errors import in_words
 from edge.core.perception import PerceptionParameters
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.schema import Bounded, ConfigError, Positive, from_mapping
 from edge.core.wire import FLOAT_PAYLOADS, PayloadType
 from edge.policy.bundle import Training
 
 
 @dataclass(frozen=True, slots=True)
-class PolicyMessages:
+class PolicyMessages(Bounded):
     """What robots take of each other: see `Manifest.payload_limit` and `payload_types`."""
 
-    payload_limit: float | None = None
+    payload_limit: Positive | None = None
     payload_types: tuple[PayloadType, ...] = FLOAT_PAYLOADS
 
 

@@ -7,8 +7,9 @@ import typing
 from collections.abc import Iterator, Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from edge.core.schema import in_words
 from edge.policy.bundle import Manifest
 from edge.policy.lpac.manifest import LpacManifest
 from edge.robot.config import RobotConfig
@@ -150,7 +151,7 @@ def _tables(
         within = _within(hint)
         if within is not None and field.name not in but:
             its = f"{path}.{field.name}" if path else field.name
-            several = typing.get_origin(hint) is tuple
+            several = "list of tables" in _kind(hint)
             below.append((within, its, f"[[{its}]]" if several else f"[{its}]"))
         rows.append((f"`{field.name}`", cell(_kind(hint)), _default(field)))
     if rows:
@@ -166,7 +167,7 @@ def _about(cls: type[Any]) -> str:
 
 
 def _hints(cls: type[Any]) -> dict[str, Any]:
-    hints = typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
@@ -174,7 +175,7 @@ def _within(hint: Any) -> type[Any] | None:
     """The dataclass that a key's table, or each of its tables, is read into."""
     if dataclasses.is_dataclass(hint):
         return typing.cast(type[Any], hint)
-    if typing.get_origin(hint) in (tuple, types.UnionType, typing.Union):
+    if typing.get_origin(hint) in (Annotated, tuple, types.UnionType, typing.Union):
         found = filter(None, map(_within, typing.get_args(hint)))
         return next(found, None)
     return None
@@ -182,6 +183,9 @@ def _within(hint: Any) -> type[Any] | None:
 
 def _kind(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        bounds = " and ".join(map(in_words, hint.__metadata__))
+        return f"{_kind(hint.__origin__)} ({bounds})"
     if dataclasses.is_dataclass(hint):
         return "table"
     if origin is Literal:

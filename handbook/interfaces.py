@@ -61,7 +61,7 @@ _INTERFACES = {
     "A radio": {
         "edge.messages.topics": "LinkDriver LinkSetting Link Topic ReceiveCallback TlsFiles Group",
         "edge.messages.admission": "Admission",
-        "edge.drivers.radio": "zenoh_radio",
+        "edge.drivers.link": "zenoh_link",
     },
     "What all of them use": {
         "edge.core": "F32 F64 Bools",

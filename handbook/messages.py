@@ -11,6 +11,7 @@ from msgspec import Meta
 
 from edge.core import wire
 from edge.core.fence import Fence
+from edge.core.schema import in_words
 from edge.drivers import flight_log
 from edge.identity import envelope, group
 from edge.identity.card import Card, Revocations
@@ -118,7 +119,7 @@ def _kind(hint: Any) -> tuple[str, str]:
     metadata = getattr(hint, "__metadata__", ())
     if metadata:
         kind, within = _kind(hint.__origin__)
-        own = " and ".join(_bounds(meta) for meta in metadata if isinstance(meta, Meta))
+        own = " and ".join(in_words(meta) for meta in metadata if isinstance(meta, Meta))
         return kind, "; each ".join(filter(None, [own, within]))
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
@@ -134,15 +135,3 @@ def _kind(hint: Any) -> tuple[str, str]:
         return f"object of {_kind(arguments[1])[0]}", _kind(arguments[1])[1]
     names = {float: "number", int: "whole number", str: "text", bool: "`true` or `false`"}
     return names.get(hint, f"`{getattr(hint, '__name__', hint)}`"), ""
-
-
-def _bounds(meta: Meta) -> str:
-    said = {
-        "at least {}": meta.ge, "at most {}": meta.le, "below {}": meta.lt, "above {}": meta.gt,
-        "at most {} long": meta.max_length, "like `{}`": meta.pattern,
-    }  # fmt: skip
-    return ", ".join(
-        text.format(f"{value:g}" if isinstance(value, float) else value)
-        for text, value in said.items()
-        if value is not None
-    )

@@ -25,7 +25,7 @@
 
     control = log_arrays("out/flight/robots")["robot-3"]["control"]
     control.time_s, control["position_m"]           # (T,), (T, 3): as that robot wrote it
-    [trial] = examine([Path("out/flight")]).trials  # all robots, on one clock
+    [record] = examine([Path("out/flight")]).records  # all robots, on one clock
 
 docs/api.md shows each task, one robot's steps by hand too. Names are those of the modules that they
 come from, whose docstrings say more. They change only with a new minor version, and CHANGELOG.md
@@ -67,6 +67,9 @@ if TYPE_CHECKING:
     from lpac.analysis.arrays import Columns as Columns
     from lpac.analysis.arrays import log_arrays as log_arrays
     from lpac.analysis.coverage import Coverage as Coverage
+    from lpac.analysis.examination import Examined as Examined
+    from lpac.analysis.examination import Wanted as Wanted
+    from lpac.analysis.examination import examine as examine
     from lpac.analysis.figures import draw_costs as draw_costs
     from lpac.analysis.figures import draw_heights as draw_heights
     from lpac.analysis.figures import draw_snapshot as draw_snapshot
@@ -76,9 +79,6 @@ if TYPE_CHECKING:
     from lpac.analysis.figures import snapshots_and_costs as snapshots_and_costs
     from lpac.analysis.flight import FlightRecord as FlightRecord
     from lpac.analysis.flight import RobotRecord as RobotRecord
-    from lpac.analysis.report import Examined as Examined
-    from lpac.analysis.report import Wanted as Wanted
-    from lpac.analysis.report import examine as examine
     from lpac.analysis.statistics import VERDICT_RULE as VERDICT_RULE
     from lpac.analysis.statistics import what_would_tell as what_would_tell
     from lpac.evaluate.evaluation import Condition as Condition
@@ -127,7 +127,7 @@ _TAKEN = {
         "draw_costs draw_heights draw_snapshot draw_states overview snapshots snapshots_and_costs"
     ),
     "lpac.analysis.flight": "FlightRecord RobotRecord",
-    "lpac.analysis.report": "Examined Wanted examine",
+    "lpac.analysis.examination": "Examined Wanted examine",
     "lpac.analysis.statistics": "VERDICT_RULE what_would_tell",
     "lpac.evaluate.evaluation": "Condition Evaluation Method MethodResult verdict_of",
     "lpac.evaluate.figures": "cost_curves distributions",

@@ -33,12 +33,12 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
+from lpac.sim.air import GROUND
 from lpac.sim.fleet.layout import ORIGIN, Settings
 from lpac.sim.fleet.robots import SimulatedRobot
 from lpac.sim.fleet.simulated import SimulatedFleet
 from lpac.sim.px4.modes import MavResult, Px4Mode
 from lpac.sim.px4.vehicle import Px4Vehicle, SimulatedSensor
-from lpac.sim.radio import GROUND
 from lpac.sim.scenario import Scenario
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE, QUICK

@@ -7,31 +7,26 @@ Perception-Action-Communication Loops", section "Decentralized Graph Neural Netw
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from edge.core import F32
 from edge.core.fleet_time import FleetTime
+from edge.core.schema import AtLeastOne, Bounded
 from edge.core.shared_map import SharedMap
 
 
 @dataclass(frozen=True, slots=True)
-class Geometry:
+class Geometry(Bounded):
     """Sizes of the graph neural network: L layers of K hops, F_0 .. F_L features.
 
     Raises ValueError that names the size for an impossible value.
     """
 
-    hops: int
-    feature_sizes: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        if self.hops < 1:
-            raise ValueError(f"hops = {self.hops}: must be at least 1")
-        if len(self.feature_sizes) < 2 or min(self.feature_sizes) < 1:
-            raise ValueError(
-                f"feature_sizes = {self.feature_sizes}: must be two or more positive sizes"
-            )
+    hops: AtLeastOne
+    feature_sizes: Annotated[tuple[AtLeastOne, ...], Meta(min_length=2)]
 
     @property
     def layers(self) -> int:

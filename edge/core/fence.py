@@ -3,20 +3,22 @@
 import functools
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from msgspec import Meta
 
 from edge.core import F64
+from edge.core.schema import Bounded, NonNegative, Positive
 
-_LARGEST_FENCE_M = 1e4
-_MOST_VERTICES = 100
+_Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
+_Vertex = Annotated[tuple[_Coordinate, ...], Meta(min_length=2, max_length=2, description="[x, y]")]
 # An angle, rad, below which three vertices lie on one line.
 _STRAIGHT_RAD = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Fence:
+class Fence(Bounded):
     """Where the robot may fly: a convex polygon, m, and heights from `floor_m` to `ceiling_m`.
 
     `vertices_m` are (x, y), 3 to 100, either way round; the last is joined to the first.
@@ -26,29 +28,15 @@ class Fence:
     not finite or out of its range.
     """
 
-    vertices_m: tuple[tuple[float, ...], ...]
-    buffer_m: float
-    floor_m: float
-    ceiling_m: float
+    vertices_m: Annotated[tuple[_Vertex, ...], Meta(min_length=3, max_length=100)]
+    buffer_m: Positive
+    floor_m: NonNegative
+    ceiling_m: Positive
 
-    def __post_init__(self) -> None:
-        if not 3 <= len(self.vertices_m) <= _MOST_VERTICES:
+    def check_rules(self) -> None:
+        if not self.floor_m < self.ceiling_m:
             raise ValueError(
-                f"vertices_m has {len(self.vertices_m)} vertices: must be 3 to {_MOST_VERTICES}"
-            )
-        for vertex in self.vertices_m:
-            if len(vertex) != 2 or not all(abs(c) <= _LARGEST_FENCE_M for c in vertex):
-                raise ValueError(
-                    f"vertices_m has {list(vertex)}: must be [x, y], each within "
-                    f"{_LARGEST_FENCE_M:g} m"
-                )
-        if not 0.0 < self.buffer_m < math.inf:
-            raise ValueError(f"buffer_m = {self.buffer_m}: must be finite and above 0")
-        if not 0.0 <= self.floor_m < math.inf:
-            raise ValueError(f"floor_m = {self.floor_m}: must be finite and at least 0")
-        if not self.floor_m < self.ceiling_m < math.inf:
-            raise ValueError(
-                f"ceiling_m = {self.ceiling_m}: must be finite and above floor_m = {self.floor_m}"
+                f"ceiling_m = {self.ceiling_m}: must be above floor_m = {self.floor_m}"
             )
         depth_m = _depth_m(self.vertices_m)
         if depth_m is None:

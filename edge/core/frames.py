@@ -17,31 +17,30 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 from geographiclib.geodesic import Geodesic
+from msgspec import Meta
 
 from edge.core import F32, F64
+from edge.core.schema import Bounded, Positive, require
 
+Latitude = Annotated[float, Meta(ge=-90.0, le=90.0)]
+Longitude = Annotated[float, Meta(ge=-180.0, le=180.0)]
 _Array = TypeVar("_Array", F32, F64)
 
 
 @dataclass(frozen=True, slots=True)
-class MissionFrame:
+class MissionFrame(Bounded):
     """Where the mission frame lies on the earth: WGS84 degrees, and heading theta in [0, 2 pi).
 
     Raises ValueError if one of them is not finite or out of its range.
     """
 
-    latitude_deg: float
-    longitude_deg: float
-    heading_rad: float
-
-    def __post_init__(self) -> None:
-        _require_on_earth("mission origin", self.latitude_deg, self.longitude_deg)
-        if not 0.0 <= self.heading_rad < math.tau:
-            raise ValueError(f"mission heading = {self.heading_rad} rad: must be in [0, 2 pi)")
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    heading_rad: Annotated[float, Meta(ge=0.0, lt=math.tau)]
 
     @property
     def frame_id(self) -> int:
@@ -80,7 +79,8 @@ class MissionFrame:
 
         Raises ValueError if the local origin is not finite or out of range.
         """
-        _require_on_earth("local origin", local_origin_latitude_deg, local_origin_longitude_deg)
+        require(Latitude, local_origin_latitude_deg, "local_origin_latitude_deg")
+        require(Longitude, local_origin_longitude_deg, "local_origin_longitude_deg")
         geodesic = Geodesic.WGS84.Inverse(
             self.latitude_deg,
             self.longitude_deg,
@@ -129,7 +129,7 @@ class LocalTransform:
 
 
 @dataclass(frozen=True, slots=True)
-class ModelScale:
+class ModelScale(Bounded):
     """Between the mission frame and the units that the policy was trained in.
 
     `env_scale` is in model units per m; `velocity_scale` is in m/s per model velocity. They are
@@ -138,16 +138,8 @@ class ModelScale:
     Raises ValueError if a scale is not finite and above 0.
     """
 
-    env_scale: float
-    velocity_scale: float
-
-    def __post_init__(self) -> None:
-        for name, scale in (
-            ("env_scale", self.env_scale),
-            ("velocity_scale", self.velocity_scale),
-        ):
-            if not 0.0 < scale < math.inf:
-                raise ValueError(f"{name} = {scale}: must be finite and above 0")
+    env_scale: Positive
+    velocity_scale: Positive
 
     def position_to_model(self, position_mission_m: _Array) -> _Array:
         """Mission position, m, in model units."""
@@ -164,10 +156,3 @@ class ModelScale:
     def velocity_to_model(self, velocity_mission_m_s: _Array) -> _Array:
         """Mission velocity, m/s, as the policy's."""
         return velocity_mission_m_s / self.velocity_scale
-
-
-def _require_on_earth(what: str, latitude_deg: float, longitude_deg: float) -> None:
-    if not -90.0 <= latitude_deg <= 90.0:
-        raise ValueError(f"{what} latitude = {latitude_deg} deg: must be in [-90, 90]")
-    if not -180.0 <= longitude_deg <= 180.0:
-        raise ValueError(f"{what} longitude = {longitude_deg} deg: must be in [-180, 180]")

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from edge.core.aggregation import AggregatedMessage
 from edge.core.arrivals import Arrivals
+from edge.core.schema import NonNegative, require
 from edge.core.shared_map import SharedMap
 from edge.core.wire import Rejection
 
@@ -69,10 +70,7 @@ class Mailbox:
     """
 
     def __init__(self, robot_id: int, max_message_age_s: float = 0.8) -> None:
-        if not 0.0 <= max_message_age_s < math.inf:
-            raise ValueError(
-                f"max_message_age_s = {max_message_age_s}: must be finite and at least 0"
-            )
+        require(NonNegative, max_message_age_s, "max_message_age_s")
         self._robot_id = robot_id
         self._max_message_age_s = max_message_age_s
         # By the paper's rule, at any age.

@@ -5,47 +5,37 @@ All maps are indexed [x, y]; one cell is one model unit; positions are in model 
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from edge.core import F64, Bools
+from edge.core.schema import Bounded, NonNegative, Positive
 
 MAX_WORLD_SIZE = 2**15  # whose raster takes 4 GiB
+_EvenSize = Annotated[int, Meta(ge=2, multiple_of=2, description="positive and even")]
 
 
 @dataclass(frozen=True, slots=True)
-class PerceptionParameters:
+class PerceptionParameters(Bounded):
     """The sizes that a policy was trained with, in model units (= cells).
 
     Raises ValueError that names the parameter for an impossible value.
     """
 
-    world_size: int
-    local_map_size: int
-    sensor_size: int
-    communication_range: float
+    world_size: Annotated[int, Meta(ge=1, le=MAX_WORLD_SIZE)]
+    local_map_size: _EvenSize
+    sensor_size: _EvenSize
+    communication_range: Positive
     # Importance of what has not been seen yet.
-    unknown_importance: float = 0.0
+    unknown_importance: NonNegative = 0.0
     # The local map is NaN there instead, for policies that tell what is unseen from what is not.
     unseen_as_nan: bool = False
     # Robots tell each other what they have seen, in cells of this size; 0: they do not.
     shared_map_cell: int = 0
 
-    def __post_init__(self) -> None:
-        if not 0 < self.world_size <= MAX_WORLD_SIZE:
-            raise ValueError(f"world_size = {self.world_size}: must be from 1 to {MAX_WORLD_SIZE}")
-        for name in ("local_map_size", "sensor_size"):
-            size = getattr(self, name)
-            if size <= 0 or size % 2:
-                raise ValueError(f"{name} = {size}: must be positive and even")
-        if not 0 < self.communication_range < np.inf:
-            raise ValueError(
-                f"communication_range = {self.communication_range}: must be positive and finite"
-            )
-        if not 0 <= self.unknown_importance < np.inf:
-            raise ValueError(
-                f"unknown_importance = {self.unknown_importance}: must be at least 0 and finite"
-            )
+    def check_rules(self) -> None:
         cell = self.shared_map_cell
         if cell < 0 or (cell and self.local_map_size % cell):
             raise ValueError(

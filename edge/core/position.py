@@ -11,8 +11,11 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
+from msgspec import Meta
+
+from edge.core.schema import Bounded, Positive
 from edge.core.vehicle import Gps, VehicleState
 
 _FIX_3D = 3
@@ -98,7 +101,7 @@ _WORDS = {
 
 
 @dataclass(frozen=True, slots=True)
-class PositionLimits:
+class PositionLimits(Bounded):
     """How good is good enough in flight, and for how long it must not be.
 
     `max_accuracy_m` is the receiver's own figure; `max_offset_m` is the distance of its fix from
@@ -110,25 +113,16 @@ class PositionLimits:
     Raises ValueError if a number is not finite or out of its range.
     """
 
-    min_satellites: int = 6
-    max_accuracy_m: float = 5.0
-    max_offset_m: float = 5.0
-    doubtful_after_s: float = 0.4
-    lost_after_s: float = 2.0
-    doubtful_lost_after_s: float = 60.0
-    good_after_s: float = 3.0
+    min_satellites: Annotated[int, Meta(ge=4)] = 6
+    max_accuracy_m: Positive = 5.0
+    max_offset_m: Positive = 5.0
+    doubtful_after_s: Annotated[float, Meta(gt=0.0, lt=_JUMP_S)] = 0.4
+    lost_after_s: Positive = 2.0
+    doubtful_lost_after_s: Positive = 60.0
+    good_after_s: Positive = 3.0
 
-    def __post_init__(self) -> None:
-        if self.min_satellites < 4:
-            raise ValueError(f"min_satellites = {self.min_satellites}: must be at least 4")
-        for name in ("max_accuracy_m", "max_offset_m", "good_after_s"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be above 0 and finite")
-        if not 0.0 < self.doubtful_after_s < _JUMP_S:
-            raise ValueError(
-                f"doubtful_after_s = {self.doubtful_after_s}: must be above 0 and below {_JUMP_S:g}"
-            )
-        if not self.doubtful_after_s < self.lost_after_s < self.doubtful_lost_after_s < math.inf:
+    def check_rules(self) -> None:
+        if not self.doubtful_after_s < self.lost_after_s < self.doubtful_lost_after_s:
             raise ValueError(
                 f"lost_after_s = {self.lost_after_s}, doubtful_lost_after_s = "
                 f"{self.doubtful_lost_after_s}: must be doubtful_after_s < lost_after_s < "

@@ -1,14 +1,36 @@
-"""Nested mappings (TOML, JSON) into frozen dataclasses; each mistake is a line naming the key."""
+"""Declared bounds: mappings (TOML, JSON) into frozen dataclasses; each mistake is one line.
+
+A field's type says all that it may be: `Annotated[float, Meta(ge=0.0, le=1.0)]` is a `Share`.
+msgspec decodes files and messages by it; `Bounded` checks what Python constructs.
+"""
 
 import dataclasses
 import functools
+import operator
+import re
+import sys
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from enum import StrEnum
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+
+import msgspec
+from msgspec import Meta
 
 T = TypeVar("T")
+
+# msgspec takes no infinite bound; NaN and infinity lie outside of any.
+MAX_FLOAT = sys.float_info.max
+_LONGEST_SHOWN = 200
+
+Finite = Annotated[float, Meta(ge=-MAX_FLOAT, le=MAX_FLOAT)]
+NonNegative = Annotated[float, Meta(ge=0.0, le=MAX_FLOAT)]
+Positive = Annotated[float, Meta(gt=0.0, le=MAX_FLOAT)]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+AtLeastZero = Annotated[int, Meta(ge=0)]
+AtLeastOne = Annotated[int, Meta(ge=1)]
+PointXY = Annotated[tuple[Finite, ...], Meta(min_length=2, max_length=2, description="[x, y]")]
 
 
 class ConfigError(ValueError):
@@ -18,32 +40,103 @@ class ConfigError(ValueError):
 def from_mapping(cls: type[T], mapping: object, where: str) -> T:
     """Build the dataclass `cls` from `mapping`; nested dataclasses from nested mappings.
 
-    `where` names the file, and then the path of keys, in errors. Field types may be bool, int,
-    float, str, Literal, StrEnum, tuple[X, ...], dict[str, X], dataclasses, unions of one of these
-    with None, and object for anything. The dataclass checks its own values in `__post_init__`, with
-    a ValueError.
+    `where` names the file, and then the path of keys, in errors. Field types may be whatever
+    msgspec decodes, with its constraints. Rules between fields are `Bounded.check_rules`, with a
+    ValueError.
 
     Raises ConfigError for an unknown or missing key, a wrong type or an impossible value.
     """
-    if not isinstance(mapping, Mapping):
-        raise ConfigError(f"{where}: expected a table, got {mapping!r}")
-    hints = _hints(cls)  # type: ignore[arg-type]
-    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    for key in mapping:
-        if key not in fields:
-            raise ConfigError(f"{where}: unknown key {key!r}; known are {', '.join(fields)}")
-    values = {}
-    for name, field in fields.items():
-        if name in mapping:
-            values[name] = _value(hints[name], mapping[name], f"{where}: {name}")
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise ConfigError(f"{where}: {name} is missing")
+    _require_known_keys(cls, mapping, where)
     try:
-        return cls(**values)
-    except ConfigError:
-        raise
-    except ValueError as error:
-        raise ConfigError(f"{where}: {error}") from None
+        return msgspec.convert(mapping, cls)
+    except msgspec.ValidationError as error:
+        raise ConfigError(explain(error, cls, mapping, where)) from None
+
+
+def explain(error: msgspec.ValidationError, hint: Any, value: object, where: str) -> str:
+    """Say in one line why msgspec does not convert a value: its innermost wrong part, and why."""
+    for part in _parts(hint, value, where):
+        try:
+            msgspec.convert(part[1], part[0])
+        except msgspec.ValidationError as of_part:
+            return explain(of_part, *part)
+    if error.__cause__ is not None:
+        return f"{where}: {error.__cause__}"
+    kind = _parse(hint).kind
+    try:
+        msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        return where + _not_of(kind, value)
+    return _fault(hint, value, where) or f"{where} = {_shown(value)}: {error}"
+
+
+class Bounded:
+    """Base of dataclasses whose values are checked however they are constructed.
+
+    Raises ValueError in the words of `from_mapping` for a value outside of its declared bounds.
+    """
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+        self.check_rules()
+
+    def check_rules(self) -> None:
+        """Raise ValueError where values do not go together; each is within its own bounds."""
+
+
+def check_bounds(instance: object) -> None:
+    """Raise ValueError for the first field of a dataclass that is outside of its bounds."""
+    cls: Any = type(instance)
+    if not _fits(instance, _part(cls)):
+        for fault in _faults(instance, _bounded_fields(cls)).values():
+            raise ValueError(fault)
+
+
+def faults(instance: object, names: tuple[str, ...]) -> dict[str, str]:
+    """Those fields of a dataclass that are outside of their bounds, each with what is wrong."""
+    cls: Any = type(instance)
+    return {} if _fits(instance, _part(cls, names)) else _faults(instance, names)
+
+
+def require(hint: Any, value: object, where: str) -> None:
+    """Raise ValueError if one value is outside of the bounds of its type."""
+    fault = _fault(hint, value, where)
+    if fault is not None:
+        raise ValueError(fault)
+
+
+def bounds_of(cls: Any) -> Mapping[str, Meta]:
+    """The constraint of each field of a dataclass that has one, else that of a list's elements."""
+    metas = {name: _bounds(hint) for name, hint in _hints(cls).items()}
+    return {name: meta for name, meta in metas.items() if meta is not None}
+
+
+def in_words(meta: Meta) -> str:
+    """What a constraint allows, to follow "must be"."""
+    if meta.description is not None:
+        return meta.description
+    least = None if meta.ge == -MAX_FLOAT else meta.ge
+    most = None if meta.le == MAX_FLOAT else meta.le
+    words = []
+    if least is not None and most is not None:
+        words.append(f"from {_number(least)} to {_number(most)}")
+        least = most = None
+    shortest, longest = meta.min_length, meta.max_length
+    if shortest is not None and longest is not None:
+        words.append(f"{shortest} to {longest} long")
+        shortest = longest = None
+    parts = {
+        "at least": least, "above": meta.gt, "at most": most, "below": meta.lt,
+        "a multiple of": meta.multiple_of, "like": meta.pattern,
+    }  # fmt: skip
+    words += [f"{text} {_number(value)}" for text, value in parts.items() if value is not None]
+    lengths = {"at least": shortest, "at most": longest}
+    words += [f"{text} {value} long" for text, value in lengths.items() if value is not None]
+    if meta.le == MAX_FLOAT:
+        words.append("finite")
+    return " and ".join(words)
 
 
 def no_options(where: str, options: Mapping[str, object]) -> None:
@@ -53,40 +146,171 @@ def no_options(where: str, options: Mapping[str, object]) -> None:
 
 
 @functools.cache
-def _hints(cls: type[Any]) -> dict[str, Any]:
-    """They are slow to look up, and statuses are decoded a hundred times a second."""
-    return typing.get_type_hints(cls)
+def _hints(cls: Any) -> dict[str, Any]:
+    """The types of a dataclass's fields by name; looking them up is slow."""
+    hints = typing.get_type_hints(cls, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
-def _value(hint: Any, value: object, where: str) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):
-        if value is None and type(None) in arguments:
-            return None
-        (hint,) = (argument for argument in arguments if argument is not type(None))
-        return _value(hint, value, where)
-    if hint is object:  # whoever takes it looks what it is
-        return value
-    if dataclasses.is_dataclass(hint):
-        return from_mapping(typing.cast(type[Any], hint), value, where)
+def _is_table(kind: Any) -> bool:
+    return dataclasses.is_dataclass(kind)
+
+
+def _bounds(hint: Any) -> Meta | None:
+    kind, metas, _ = _parse(hint)
+    is_list = typing.get_origin(kind) is tuple
+    return metas[0] if metas else _bounds(typing.get_args(kind)[0]) if is_list else None
+
+
+@functools.cache
+def _bounded_fields(cls: Any) -> tuple[str, ...]:
+    return tuple(name for name, hint in _hints(cls).items() if _is_bounded(hint))
+
+
+@functools.cache
+def _part(cls: Any, names: tuple[str, ...] | None = None) -> Any:
+    """A type of those fields alone, or of all that are bounded, by which msgspec checks."""
+    chosen = _bounded_fields(cls) if names is None else names
+    return msgspec.defstruct(cls.__name__, [(name, _hints(cls)[name]) for name in chosen])
+
+
+def _fits(instance: object, part: Any) -> bool:
+    """Whether msgspec takes it; it does not take numpy's numbers, which may be within bounds."""
+    try:
+        msgspec.convert(instance, part, from_attributes=True)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _faults(instance: object, names: tuple[str, ...]) -> dict[str, str]:
+    cls: Any = type(instance)
+    hints = _hints(cls)
+    found = {name: _fault(hints[name], getattr(instance, name), name) for name in names}
+    return {name: fault for name, fault in found.items() if fault is not None}
+
+
+def _is_bounded(hint: Any) -> bool:
+    kind, metas, _ = _parse(hint)
+    is_choice = typing.get_origin(kind) is Literal
+    return bool(metas) or is_choice or any(map(_is_bounded, typing.get_args(kind)))
+
+
+class _Parsed(NamedTuple):
+    """A field's type without None and constraints, its constraints, whether it may be None."""
+
+    kind: Any
+    metas: tuple[Meta, ...]
+    optional: bool
+
+
+@functools.cache
+def _parse(hint: Any) -> _Parsed:
+    metas: tuple[Meta, ...] = ()
+    optional = False
+    while True:
+        origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+        if origin is Annotated:
+            metas += tuple(each for each in hint.__metadata__ if isinstance(each, Meta))
+            hint = hint.__origin__
+        elif origin in (types.UnionType, typing.Union) and type(None) in arguments:
+            others = (each for each in arguments if each is not type(None))
+            hint, optional = functools.reduce(operator.or_, others), True
+        else:
+            return _Parsed(hint, metas, optional)
+
+
+def _parts(hint: Any, value: object, where: str) -> Iterator[tuple[Any, Any, str]]:
+    """What of a table or list has a type of its own: the type, the value, and where it is."""
+    kind = _parse(hint).kind
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if isinstance(value, Mapping):
+        if _is_table(kind):
+            for name, of_field in _hints(kind).items():
+                if name in value:
+                    yield of_field, value[name], f"{where}: {name}"
+        elif origin is dict:
+            for key, each in value.items():
+                yield arguments[0], key, f"{where}: key"
+                yield arguments[1], each, f"{where}: {key}"
+    elif origin is tuple and isinstance(value, list | tuple):
+        repeated = arguments[1:] == (Ellipsis,)
+        for i, each in enumerate(value if repeated else value[: len(arguments)]):
+            yield arguments[0 if repeated else i], each, f"{where}[{i}]"
+
+
+def _fault(hint: Any, value: Any, where: str) -> str | None:
+    """What is outside of its bounds in a value of the right type, as one line."""
+    kind, metas, optional = _parse(hint)
+    if value is None and optional:
+        return None
+    for meta in metas:
+        if not _holds(meta, value):
+            return f"{where} = {_shown(value)}: must be {in_words(meta)}"
+    if typing.get_origin(kind) is Literal and value not in typing.get_args(kind):
+        return where + _not_of(kind, value)
+    return next(filter(None, (_fault(*part) for part in _parts(hint, value, where))), None)
+
+
+def _holds(meta: Meta, value: Any) -> bool:
+    return (
+        (meta.ge is None or value >= meta.ge)
+        and (meta.gt is None or value > meta.gt)
+        and (meta.le is None or value <= meta.le)
+        and (meta.lt is None or value < meta.lt)
+        and (meta.multiple_of is None or value % meta.multiple_of == 0)
+        and (meta.min_length is None or len(value) >= meta.min_length)
+        and (meta.max_length is None or len(value) <= meta.max_length)
+        and (meta.pattern is None or re.search(meta.pattern, value) is not None)
+    )
+
+
+def _require_known_keys(hint: Any, value: object, where: str) -> None:
+    kind = _parse(hint).kind
+    if _is_table(kind) and isinstance(value, Mapping):
+        known = _hints(kind)
+        for key in value:
+            if key not in known:
+                raise ConfigError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")
+    for part in _parts(hint, value, where):
+        _require_known_keys(*part)
+
+
+def _not_of(kind: Any, value: object) -> str:
+    """Why a value is not of a type, to follow its key."""
+    if _is_table(kind):
+        if not isinstance(value, Mapping):
+            return f": expected a table, got {_shown(value)}"
+        missing = (
+            field.name
+            for field in dataclasses.fields(kind)
+            if field.name not in value
+            and field.default is dataclasses.MISSING
+            and field.default_factory is dataclasses.MISSING
+        )
+        return f": {next(missing)} is missing"
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if isinstance(kind, type) and issubclass(kind, StrEnum):
+        origin, arguments = Literal, tuple(map(str, kind))
     if origin is Literal:
-        if value not in arguments:
-            allowed = ", ".join(repr(argument) for argument in arguments)
-            raise ConfigError(f"{where} = {value!r}: allowed are {allowed}")
-        return value
-    if isinstance(hint, type) and issubclass(hint, StrEnum):
-        return hint(_value(Literal[tuple(str(member) for member in hint)], value, where))
-    if origin is tuple and isinstance(value, list):
-        return tuple(_value(arguments[0], v, f"{where}[{i}]") for i, v in enumerate(value))
-    if origin is dict and isinstance(value, Mapping):
-        return {key: _value(arguments[1], v, f"{where}: {key}") for key, v in value.items()}
-    if hint is float and type(value) is int:
-        try:
-            return float(value)
-        except OverflowError:
-            raise ConfigError(f"{where}: is too large a number") from None
-    if type(value) is hint:
-        return value
-    in_words = {tuple: "a list", dict: "a table", str: "text in quotes"}
-    expected = in_words.get(origin or hint, getattr(hint, "__name__", ""))
-    raise ConfigError(f"{where} = {value!r}: expected {expected}")
+        allowed = ", ".join(repr(each) for each in arguments)
+        return f" = {_shown(value)}: allowed are {allowed}"
+    if kind is float and type(value) is int:
+        return ": is too large a number"
+    words = {dict: "a table", str: "text in quotes", tuple: "a list"}
+    expected = words.get(origin or kind, getattr(kind, "__name__", str(kind)))
+    if origin is tuple and Ellipsis not in arguments:
+        expected = f"a list of {len(arguments)}"
+    return f" = {_shown(value)}: expected {expected}"
+
+
+def _shown(value: object) -> str:
+    try:
+        text = repr(list(value) if isinstance(value, tuple) else value)
+    except ValueError:  # Python writes no whole number of more than 4300 digits
+        return "a number of too many digits"
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+
+
+def _number(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -14,11 +14,14 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from edge.core import F32, F64
+from edge.core.schema import Bounded, NonNegative
 
 # To make a raster of more takes a robot minutes.
 MOST_FEATURES = 2000
@@ -27,61 +30,34 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COUNT = re.compile(r"\+?\d+", re.ASCII)
 # Far beyond every world, and small enough to be squared without loss.
 _LONGEST = 1e7
+_Coordinate = Annotated[float, Meta(ge=-_LONGEST, le=_LONGEST)]
+_Width = Annotated[float, Meta(gt=0.0, le=_LONGEST)]
 # Offsets from a cell's centre, and weights, of the quadrature along one axis of a cell.
 _NODES, _WEIGHTS = (0.5 * values for values in np.polynomial.legendre.leggauss(4))
 
 
 @dataclass(frozen=True, slots=True)
-class GaussianFeature:
+class GaussianFeature(Bounded):
     """A bivariate normal density times `scale`: its integral over the plane is `scale`.
 
     Raises ValueError unless all numbers are finite, sigma > 0, |correlation| < 1 and scale >= 0.
     """
 
-    mean: tuple[float, float]
-    sigma: tuple[float, float]
-    correlation: float = 0.0
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        numbers = (*self.mean, *self.sigma, self.correlation, self.scale)
-        if not all(map(math.isfinite, numbers)):
-            raise ValueError(f"{self} has a number that is not finite")
-        _check_lengths((*self.mean, *self.sigma))
-        for name, sigma in zip(("sigma_x", "sigma_y"), self.sigma, strict=True):
-            if sigma <= 0.0:
-                raise ValueError(f"{name} is {sigma}, must be > 0")
-        if abs(self.correlation) >= 1.0:
-            raise ValueError(f"rho is {self.correlation}, must be between -1 and 1, exclusive")
-        if self.scale < 0.0:
-            raise ValueError(f"scale is {self.scale}, must be >= 0")
+    mean: tuple[_Coordinate, _Coordinate]
+    sigma: tuple[_Width, _Width]
+    correlation: Annotated[float, Meta(gt=-1.0, lt=1.0)] = 0.0
+    scale: NonNegative = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class PolygonFeature:
+class PolygonFeature(Bounded):
     """The same importance throughout a polygon, which may be concave and runs either way round.
 
     Raises ValueError unless there are 3 vertices or more, all numbers are finite, importance >= 0.
     """
 
-    vertices: tuple[tuple[float, float], ...]
-    importance: float
-
-    def __post_init__(self) -> None:
-        if len(self.vertices) < 3:
-            raise ValueError(f"num_vertices is {len(self.vertices)}, must be >= 3")
-        numbers = (self.importance, *(c for vertex in self.vertices for c in vertex))
-        if not all(map(math.isfinite, numbers)):
-            raise ValueError("importance or a vertex is not finite")
-        _check_lengths(numbers[1:])
-        if self.importance < 0.0:
-            raise ValueError(f"importance is {self.importance}, must be >= 0")
-
-
-def _check_lengths(lengths: tuple[float, ...]) -> None:
-    for length in lengths:
-        if abs(length) > _LONGEST:
-            raise ValueError(f"{length} is too far, must be within {_LONGEST:g} of the world")
+    vertices: Annotated[tuple[tuple[_Coordinate, _Coordinate], ...], Meta(min_length=3)]
+    importance: NonNegative
 
 
 Feature = GaussianFeature | PolygonFeature

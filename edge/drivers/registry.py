@@ -45,7 +45,7 @@ _BUILT_IN = {
         EntryPoint("lpac", "edge.policy.lpac.policy:LpacPolicy", _POLICIES),
         EntryPoint("world", "edge.drivers.world_sensor:world_sensor", _SENSORS),
         EntryPoint("px4", "edge.drivers.px4.driver:px4_vehicle", _VEHICLES),
-        EntryPoint("zenoh", "edge.drivers.radio:zenoh_radio", _LINKS),
+        EntryPoint("zenoh", "edge.drivers.link:zenoh_link", _LINKS),
         EntryPoint("lpac", "lpac.train.lpac:lpac_network", _LEARNABLE),
     )
 }

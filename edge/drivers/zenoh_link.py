@@ -184,12 +184,6 @@ class ZenohLink:
         """
         return robot_id in self._others()
 
-    def duplicates(self) -> frozenset[int]:
-        """The robot ids that more than one session claims, the own among them."""
-        with self._lock:
-            claims = Counter(id_ for id_, _ in self._tokens)
-        return frozenset(id_ for id_, count in claims.items() if count > 1)
-
     def peers(self) -> int:
         """The number of zenoh peers and routers connected to this session."""
         session = self._session

@@ -7,9 +7,12 @@ consumption of this flight is measured, so that a weak pack shows after a minute
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from msgspec import Meta
+
+from edge.core.schema import Bounded
 
 # The voltage falls when the motors start, and PX4's estimate of the charge with it.
 _SETTLED_S = 15.0
@@ -25,10 +28,11 @@ _MEDIAN_S = 5.0
 _SPEED_SHARE = 0.7
 # PX4's MPC_LAND_SPEED is 0.7 m/s; and what it takes to find the ground and stop the motors.
 _LANDING_M_S, _TOUCHDOWN_S = 0.5, 5.0
+_UpToAnHour = Annotated[float, Meta(ge=0.0, le=3600.0)]
 
 
 @dataclass(frozen=True, slots=True)
-class EnergyParameters:
+class EnergyParameters(Bounded):
     """What a pack is worth; times in s.
 
     `endurance_s` is a flight with a full pack until it is empty, for as long as none was measured.
@@ -39,22 +43,11 @@ class EnergyParameters:
     Raises ValueError that names what is impossible.
     """
 
-    endurance_s: float = 900.0
-    cells: int = 0
-    low_cell_v: float = 3.4
-    queue_s: float = 10.0
-    reserve_s: float = 60.0
-
-    def __post_init__(self) -> None:
-        if not 60.0 <= self.endurance_s <= 36_000.0:
-            raise ValueError(f"endurance_s = {self.endurance_s}: must be from 60 to 36000")
-        if not 0 <= self.cells <= 14:
-            raise ValueError(f"cells = {self.cells}: must be from 0 (not known) to 14")
-        if not 2.0 <= self.low_cell_v <= 4.2:
-            raise ValueError(f"low_cell_v = {self.low_cell_v}: must be from 2 to 4.2")
-        for name in ("queue_s", "reserve_s"):
-            if not 0.0 <= getattr(self, name) <= 3600.0:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be from 0 to 3600")
+    endurance_s: Annotated[float, Meta(ge=60.0, le=36_000.0)] = 900.0
+    cells: Annotated[int, Meta(ge=0, le=14)] = 0
+    low_cell_v: Annotated[float, Meta(ge=2.0, le=4.2)] = 3.4
+    queue_s: _UpToAnHour = 10.0
+    reserve_s: _UpToAnHour = 60.0
 
 
 class Energy(NamedTuple):

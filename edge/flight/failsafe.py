@@ -11,11 +11,15 @@ No parameter says what happens when the position is lost.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
+from msgspec import Meta
+
+from edge.core.schema import Positive, require
 from edge.core.vehicle import GPS_CONTROL
 
 RemoteControl = Literal["pilot", "none"]
+CommandTimeout = Annotated[float, Meta(gt=0.2, le=0.7)]
 Parameters = Mapping[str, int | float | None]
 
 # Altitude drifts by 1.6 m under velocity setpoints.
@@ -138,14 +142,9 @@ def required(
 
     Raises ValueError if one of them is out of its range.
     """
-    if rc not in ("pilot", "none"):
-        raise ValueError(f"rc = {rc!r}: allowed are 'pilot', 'none'")
-    if not 0.0 < ceiling_m < math.inf:
-        raise ValueError(f"ceiling_m = {ceiling_m}: must be finite and above 0")
-    if not 0.2 < command_timeout_s <= 0.7:
-        raise ValueError(
-            f"command_timeout_s = {command_timeout_s}: must be above 0.2 and at most 0.7"
-        )
+    require(RemoteControl, rc, "rc")
+    require(Positive, ceiling_m, "ceiling_m")
+    require(CommandTimeout, command_timeout_s, "command_timeout_s")
     return (
         Requirement(
             "COM_OF_LOSS_T",

@@ -6,9 +6,10 @@ round, so that truth holds whatever the estimates say. docs/safety.md shows the 
 
 import functools
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
+from edge.core.schema import Bounded, NonNegative, Positive
 from edge.flight.safety import MotionLimits, stopping_m
 
 # A receiver reports a radius that holds its error 68 % of the time. If errors are normal, twice
@@ -44,7 +45,7 @@ class Margin(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorBudget:
+class ErrorBudget(Bounded):
     """How wrong one vehicle may be at worst, m; `[errors]` of robot.toml.
 
     `gps_m`: its estimate's horizontal error. `wind_m`: how far a gust, or control, carries it from
@@ -58,23 +59,15 @@ class ErrorBudget:
     Raises ValueError if one is not finite or below 0 (`drone_m`: not above 0).
     """
 
-    gps_m: float = _UNREPORTED_M
-    wind_m: float = 0.75
-    wind_m_s: float = 8.0
-    height_apart_m: float = 2.0
-    height_common_m: float = 3.0
-    takeoffs_height_m: float = 0.5
-    height_control_m: float = 0.5
-    pads_height_m: float = 0.5
-    drone_m: float = 0.5
-
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{each.name} = {value}: must be finite and at least 0")
-        if self.drone_m == 0.0:
-            raise ValueError("drone_m = 0.0: must be above 0")
+    gps_m: NonNegative = _UNREPORTED_M
+    wind_m: NonNegative = 0.75
+    wind_m_s: NonNegative = 8.0
+    height_apart_m: NonNegative = 2.0
+    height_common_m: NonNegative = 3.0
+    takeoffs_height_m: NonNegative = 0.5
+    height_control_m: NonNegative = 0.5
+    pads_height_m: NonNegative = 0.5
+    drone_m: Positive = 0.5
 
     @property
     def position_m(self) -> float:

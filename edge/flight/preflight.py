@@ -3,14 +3,17 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from edge.core.counted import counted
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.px4_version import OLDEST, is_too_old
+from edge.core.schema import Bounded, Positive
 from edge.core.vehicle import Gps, VehicleState
 from edge.flight.failsafe import RemoteControl
 from edge.flight.landing import in_the_way, standing_robots
@@ -26,33 +29,18 @@ _FIX_3D = 3
 
 
 @dataclass(frozen=True, slots=True)
-class PreflightLimits:
+class PreflightLimits(Bounded):
     """How good is good enough; `min_battery` is a share, 0 to 1.
 
     Raises ValueError if a number is not finite or out of its range.
     """
 
-    min_battery: float = 0.5
-    min_satellites: int = 8
-    max_hdop: float = 2.0
-    max_position_age_s: float = 0.5
-    max_ground_age_s: float = 3.0
-    max_time_uncertainty_s: float = 0.2
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.min_battery <= 1.0:
-            raise ValueError(f"min_battery = {self.min_battery}: must be above 0 and at most 1")
-        if self.min_satellites < 4:
-            raise ValueError(f"min_satellites = {self.min_satellites}: must be at least 4")
-        for name in (
-            "max_hdop",
-            "max_position_age_s",
-            "max_ground_age_s",
-            "max_time_uncertainty_s",
-        ):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{name} = {value}: must be finite and above 0")
+    min_battery: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
+    min_satellites: Annotated[int, Meta(ge=4)] = 8
+    max_hdop: Positive = 2.0
+    max_position_age_s: Positive = 0.5
+    max_ground_age_s: Positive = 3.0
+    max_time_uncertainty_s: Positive = 0.2
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,24 +5,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from edge.core.fence import Fence
+from edge.core.schema import Bounded, Positive
 from edge.messages.codes import CheckCode, FailedCheck
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class Reach(Bounded):
     """The outermost fence: around where the robot stands when it is armed, and above it, m.
 
     The mission origin and every corner of the fence lie within `distance_m` of there, the fence's
     ceiling within `ceiling_m`. Raises ValueError if one is not finite or not above 0.
     """
 
-    distance_m: float = 200.0
-    ceiling_m: float = 120.0
-
-    def __post_init__(self) -> None:
-        for name in ("distance_m", "ceiling_m"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be above 0 and finite")
+    distance_m: Positive = 200.0
+    ceiling_m: Positive = 120.0
 
     def origin_beyond(self, place_m: Sequence[float] | None) -> FailedCheck | None:
         """What is wrong with a mission origin that a robot at this place (x, y) of it has.

@@ -21,6 +21,7 @@ import numpy as np
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
+from edge.core.schema import Bounded, NonNegative, Positive
 from edge.core.vehicle import Vector
 from edge.flight.silence import SilenceLimits, highest_still_m, nearest_on_way_m, strays_m
 
@@ -36,7 +37,7 @@ _PASSING_M_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class MotionLimits:
+class MotionLimits(Bounded):
     """How fast the robot may move, and how its vehicle answers.
 
     `max_acceleration_m_s2` is at most 0.7 of what the vehicle reaches: it may have to brake and to
@@ -46,18 +47,10 @@ class MotionLimits:
     Raises ValueError if one is not finite and above 0 (the lag: at least 0).
     """
 
-    max_speed_m_s: float
-    max_climb_m_s: float
-    max_acceleration_m_s2: float
-    lag_s: float
-
-    def __post_init__(self) -> None:
-        for name in ("max_speed_m_s", "max_climb_m_s", "max_acceleration_m_s2"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{name} = {value}: must be finite and above 0")
-        if not 0.0 <= self.lag_s < math.inf:
-            raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
+    max_speed_m_s: Positive
+    max_climb_m_s: Positive
+    max_acceleration_m_s2: Positive
+    lag_s: NonNegative
 
 
 class SeparationLimits(NamedTuple):

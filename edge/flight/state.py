@@ -9,15 +9,19 @@ estimator's zero is not the pad.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
+
+from msgspec import Meta
 
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
+from edge.core.schema import Bounded, PointXY, Positive
 from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
+from edge.flight.failsafe import CommandTimeout
 from edge.flight.lift import Lift
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
@@ -25,7 +29,6 @@ from edge.flight.safety import Closest, MotionLimits, SeparationLimits, stopping
 from edge.flight.silence import SilenceLimits
 from edge.messages.codes import FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
-    MAX_SLOT,
     FlightState,
     GroundState,
     Order,
@@ -33,6 +36,7 @@ from edge.messages.mission import (
     OrderResult,
     Place,
     SafetyAction,
+    SlotNumber,
 )
 
 # How long the autopilot may take to go to offboard.
@@ -47,6 +51,7 @@ _STARTED = Reason(ReasonCode.PROGRAM_STARTED, "program started")
 # Who has it land: the ground, a return that came home, or what cannot wait.
 LandBy = Literal["ground", "return", "safety"]
 RemoteControlLost = Literal["alarm", "hold", "land"]
+_BatteryShare = Annotated[float, Meta(gt=0.0, lt=1.0)]
 
 
 class Px4Change(NamedTuple):
@@ -60,7 +65,7 @@ class Px4Change(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class FlightParameters:
+class FlightParameters(Bounded):
     """What one robot's flight is measured by; times in s, distances in m, speeds in m/s.
 
     The robot flies at `base_height_m + slot * slot_spacing_m`: the policy is planar and GPS errs by
@@ -70,39 +75,29 @@ class FlightParameters:
     Raises ValueError that names what is impossible.
     """
 
-    slot: int
-    landing_point_m: tuple[float, ...]
-    base_height_m: float = 5.0
-    slot_spacing_m: float = 4.5
-    min_separation_m: float = 1.5
-    battery_low: float = 0.25
-    battery_critical: float = 0.15
-    command_timeout_s: float = 0.5
-    ground_timeout_s: float = 3.0
-    ground_lost_land_s: float = 10.0
-    takeoff_timeout_s: float = 15.0
-    hover_land_s: float = 60.0
+    slot: SlotNumber
+    landing_point_m: PointXY
+    base_height_m: Positive = 5.0
+    slot_spacing_m: Positive = 4.5
+    min_separation_m: Positive = 1.5
+    battery_low: _BatteryShare = 0.25
+    battery_critical: _BatteryShare = 0.15
+    command_timeout_s: CommandTimeout = 0.5
+    ground_timeout_s: Positive = 3.0
+    ground_lost_land_s: Positive = 10.0
+    takeoff_timeout_s: Positive = 15.0
+    hover_land_s: Positive = 60.0
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.slot <= MAX_SLOT:
-            raise ValueError(f"slot = {self.slot}: must be from 0 to {MAX_SLOT}")
-        if len(self.landing_point_m) != 2 or not all(map(math.isfinite, self.landing_point_m)):
-            raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be [x, y]")
-        for name in (
-            "base_height_m", "slot_spacing_m", "min_separation_m", "command_timeout_s",
-            "ground_timeout_s", "ground_lost_land_s", "takeoff_timeout_s", "hover_land_s",
-        ):  # fmt: skip
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be above 0 and finite")
+    def check_rules(self) -> None:
         if self.min_separation_m >= self.slot_spacing_m:
             raise ValueError(
                 f"min_separation_m = {self.min_separation_m}: must be below slot_spacing_m = "
                 f"{self.slot_spacing_m}, or robots at their own heights would stop each other"
             )
-        if not 0.0 < self.battery_critical < self.battery_low < 1.0:
+        if not self.battery_critical < self.battery_low:
             raise ValueError(
-                f"battery_critical = {self.battery_critical}, battery_low = {self.battery_low}: "
-                "must be 0 < battery_critical < battery_low < 1"
+                f"battery_critical = {self.battery_critical}: must be below battery_low = "
+                f"{self.battery_low}"
             )
 
     @property

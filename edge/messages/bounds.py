@@ -3,9 +3,7 @@
 The bounds are far outside of what a fleet needs, and inside of what costs or breaks anything.
 """
 
-import math
-import typing
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -36,32 +34,3 @@ UnixSeconds = Annotated[float, Meta(ge=0.0, le=1e11)]
 Milliseconds = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Share = Annotated[float, Meta(ge=-0.01, le=10.0)]
 Precision = Annotated[float, Meta(ge=0.0, le=1e4)]
-
-
-class Bound(NamedTuple):
-    """A number, or each of a list's, is from `least` to `greatest`."""
-
-    least: float
-    greatest: float
-
-    def holds(self, value: float) -> bool:
-        """Whether it is; NaN is not."""
-        return self.least <= value <= self.greatest
-
-
-def bounds_of(cls: type[Any]) -> dict[str, Bound]:
-    """The bounds of a message's numeric fields, and of its lists of numbers, by name."""
-    hints = typing.get_type_hints(cls, include_extras=True)
-    found = {name: _bound(hint) for name, hint in hints.items()}
-    return {name: bound for name, bound in found.items() if bound is not None}
-
-
-def _bound(hint: Any) -> Bound | None:
-    if typing.get_origin(hint) is dict:
-        return None
-    for meta in getattr(hint, "__metadata__", ()):
-        if isinstance(meta, Meta) and (meta.ge is not None or meta.le is not None):
-            least = -math.inf if meta.ge is None else float(meta.ge)
-            return Bound(least, math.inf if meta.le is None else float(meta.le))
-    inner = (_bound(argument) for argument in typing.get_args(hint) if argument is not Ellipsis)
-    return next((bound for bound in inner if bound is not None), None)

@@ -6,10 +6,12 @@ defaults; in what the ground says, whatever keeps a robot safe must be there.
 """
 
 import dataclasses
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import msgspec
 
+from edge.core.schema import explain
 from edge.messages.mission import GroundState, Order
 
 T = TypeVar("T")
@@ -54,7 +56,7 @@ def decode(kind: type[T], data: bytes | msgspec.Raw) -> T:
                 raise MessageError(f"{kind.__name__}: {', '.join(sorted(missing))} is missing")
         message = _decoder(kind).decode(data)
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise MessageError(f"{kind.__name__}: {error}") from None
+        raise MessageError(_why(error, kind, data)) from None
     asked = set(getattr(message, "must_understand", ()))
     if asked and (unknown := asked - {field.name for field in dataclasses.fields(kind)}):  # type: ignore[arg-type]
         names = ", ".join(sorted(unknown))
@@ -66,3 +68,11 @@ def _decoder(kind: type[T]) -> "msgspec.json.Decoder[T]":
     if kind not in _decoders:
         _decoders[kind] = msgspec.json.Decoder(kind)
     return _decoders[kind]
+
+
+def _why(error: Exception, kind: type[Any], data: bytes | msgspec.Raw) -> str:
+    """Why something is no message of that kind: where it can be told, key, value and bounds."""
+    if isinstance(error, msgspec.ValidationError):
+        with suppress(msgspec.MsgspecError, RecursionError):
+            return explain(error, kind, msgspec.json.decode(data), kind.__name__)
+    return f"{kind.__name__}: {error}"

@@ -20,13 +20,13 @@ from msgspec import Meta
 
 from edge.core import Bools
 from edge.core.fence import Fence
-from edge.core.frames import MissionFrame
+from edge.core.frames import Latitude, Longitude, MissionFrame
 from edge.core.memory import EXPLORED_CELLS
 from edge.core.position import PositionCause, PositionQuality
+from edge.core.schema import Bounded, bounds_of, faults
 from edge.messages.bounds import (
     MOST_ROBOTS,
     MOST_TEXTS,
-    Bound,
     Count,
     Degrees,
     Metres,
@@ -44,14 +44,14 @@ from edge.messages.bounds import (
     SystemId,
     TimeBase,
     UnixSeconds,
-    bounds_of,
 )
 from edge.messages.codes import FailedCheck, Reason, ReasonCode, Refusal
 
 # Of what is said now. A message of another version is taken as far as it can be; see the codec.
 VERSION = 3
 ORDER_LIFETIME_S = 10.0
-MAX_SLOT = 1000
+Heading = Annotated[float, Meta(ge=0.0, lt=360.0)]
+SlotNumber = Annotated[int, Meta(ge=0, le=1000)]
 # A mission starts within this distance of the robot's own height.
 AT_SLOT_M = 1.0
 _OVER_LANDING_POINT_M = 1.5
@@ -60,7 +60,7 @@ Version = Annotated[int, Meta(ge=0, le=10_000)]
 # What an older program must know of, or else refuse the message: names of fields.
 MustUnderstand = Annotated[tuple[Name, ...], Meta(max_length=20)]
 FailedChecks = Annotated[tuple[FailedCheck, ...], Meta(max_length=MOST_TEXTS)]
-Point = tuple[Metres, Metres]
+_Point = Annotated[tuple[Metres, ...], Meta(min_length=2, max_length=2, description="[x, y]")]
 Vector = tuple[Metres, Metres, Metres]
 # See `edge.core.arrivals`; a newer program may know more bins.
 ArrivalCounts = Annotated[tuple[Count, ...], Meta(max_length=20)]
@@ -97,20 +97,15 @@ OrderKind = Literal["takeoff", "start", "pilot", "rejoin", "reset", "disarm", "k
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
+class Origin(Bounded):
     """Where the mission frame lies, as the operator sets it: degrees, heading in [0, 360).
 
     Raises ValueError if a number is out of its range.
     """
 
-    latitude_deg: Degrees
-    longitude_deg: Degrees
-    heading_deg: Degrees
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.heading_deg < 360.0:
-            raise ValueError(f"heading_deg = {self.heading_deg}: must be in [0, 360)")
-        self.frame()
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    heading_deg: Heading
 
     def frame(self) -> MissionFrame:
         """The mission frame itself."""
@@ -118,17 +113,11 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Place(Bounded):
     """A robot's place in the flight: its height's `slot`, and where it lands, (x, y), m."""
 
-    slot: int
-    landing_point_m: tuple[Metres, ...]
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.slot <= MAX_SLOT:
-            raise ValueError(f"slot = {self.slot}: must be from 0 to {MAX_SLOT}")
-        if len(self.landing_point_m) != 2 or not all(map(math.isfinite, self.landing_point_m)):
-            raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be [x, y]")
+    slot: SlotNumber
+    landing_point_m: _Point
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,13 +344,9 @@ class RobotStatus:
     version: Version = VERSION
 
     def __post_init__(self) -> None:
-        for name, bound in _status_bounds().items():
-            value = getattr(self, name)
-            numbers = value if isinstance(value, tuple) else (value,)
-            if value is None or all(map(bound.holds, numbers)):
-                continue
+        for name, fault in faults(self, _numbers_of_status()).items():
             if name in _NEVER_NONE:
-                raise ValueError(f"{name} = {value}: must be {bound.least:g} to {bound.greatest:g}")
+                raise ValueError(fault)
             object.__setattr__(self, name, None)
         if len(self.landing_point_m) != 2:
             raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be 2 numbers")
@@ -378,8 +363,8 @@ _NEVER_NONE = (
 
 
 @cache
-def _status_bounds() -> dict[str, Bound]:
-    return bounds_of(RobotStatus)
+def _numbers_of_status() -> tuple[str, ...]:
+    return tuple(name for name, meta in bounds_of(RobotStatus).items() if meta.ge is not None)
 
 
 def is_over_landing_point(status: RobotStatus) -> bool:

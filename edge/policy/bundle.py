@@ -8,7 +8,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import math
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -17,7 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from edge.core.file_errors import in_words
 from edge.core.perception import PerceptionParameters
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.schema import Bounded, ConfigError, Positive, from_mapping
 from edge.core.wire import FLOAT_PAYLOADS, PayloadType
 
 # Of the manifests that this version reads and writes.
@@ -38,29 +37,23 @@ class BundleError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Training:
+class Training(Bounded):
     """The scales and the world that the policy was trained with.
 
     Model units are metres here: `max_speed` is in units/s, `time_step` in s. `idf_truncation` is
     in standard deviations; `idf_norm` is the importance of the most important cell.
     """
 
-    max_speed: float
-    time_step: float
-    env_scale: float = 1.0
-    velocity_scale: float = 1.0
-    idf_truncation: float = 2.0
-    idf_norm: float = 1.0
-
-    def __post_init__(self) -> None:
-        for each in dataclasses.fields(self):
-            value = getattr(self, each.name)
-            if not 0 < value < float("inf"):
-                raise ValueError(f"{each.name} = {value}: must be positive and finite")
+    max_speed: Positive
+    time_step: Positive
+    env_scale: Positive = 1.0
+    velocity_scale: Positive = 1.0
+    idf_truncation: Positive = 2.0
+    idf_norm: Positive = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Manifest:
+class Manifest(Bounded):
     """The bundle's description.
 
     `perception` is None in one that no robot can fly. `provenance` says where the bundle came from,
@@ -77,13 +70,11 @@ class Manifest:
     provenance: dict[str, str]
     files: dict[str, str]
     family: str = LPAC
-    payload_limit: float | None = None
+    payload_limit: Positive | None = None
     payload_types: tuple[PayloadType, ...] = FLOAT_PAYLOADS
     parameters: dict[str, object] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        if self.payload_limit is not None and not 0.0 < self.payload_limit < math.inf:
-            raise ValueError(f"payload_limit = {self.payload_limit}: must be finite and above 0")
+    def check_rules(self) -> None:
         if self.schema != SCHEMA_VERSION:
             raise ValueError(f"schema = {self.schema}: this version reads {SCHEMA_VERSION}")
         for key in self.parameters.keys() & _KEYS:

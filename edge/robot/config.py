@@ -4,13 +4,14 @@ Relative paths are meant from the file's own folder. Every mistake is one line t
 the key, the value and what is allowed.
 """
 
-import math
 import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 from edge.core.address import (
     host_and_port,
@@ -24,8 +25,15 @@ from edge.core.fence import Fence
 from edge.core.file_errors import in_words
 from edge.core.frames import ModelScale
 from edge.core.position import PositionLimits
-from edge.core.schema import ConfigError, from_mapping
-from edge.core.wire import MAX_ROBOT_ID, PAYLOAD_TYPES, PayloadType
+from edge.core.schema import (
+    MAX_FLOAT,
+    Bounded,
+    ConfigError,
+    NonNegative,
+    Positive,
+    from_mapping,
+)
+from edge.core.wire import PAYLOAD_TYPES, PayloadType
 from edge.flight.energy import EnergyParameters
 from edge.flight.failsafe import required
 from edge.flight.margins import ErrorBudget, Margin
@@ -33,29 +41,22 @@ from edge.flight.preflight import PreflightLimits
 from edge.flight.reach import Reach
 from edge.flight.safety import MotionLimits
 from edge.flight.state import FlightParameters, RemoteControlLost, Robot
+from edge.messages.bounds import RobotId
 from edge.robot.pac import PacParameters
 
-# What fleet.toml has too. Each raises ValueError, one line that says what is allowed.
+# What fleet.toml has too. Each function raises ValueError, one line that says what is allowed.
 
-
-def require_name(key: str, name: str) -> None:
-    """Of a fleet, a robot, a site: a part of radio keys and of file names."""
-    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,31}", name) is None:
-        raise ValueError(
-            f"{key}{name!r}: must be 1 to 32 letters, digits, '-' and '_', and not start with '-'"
-        )
-
-
-def require_robot_id(robot_id: int) -> None:
-    """Of one robot in its fleet."""
-    if not 0 <= robot_id <= MAX_ROBOT_ID:
-        raise ValueError(f"robot_id = {robot_id}: must be from 0 to {MAX_ROBOT_ID}")
-
-
-def require_system_id(system_id: int) -> None:
-    """PX4's MAV_SYS_ID."""
-    if not 1 <= system_id <= 255:
-        raise ValueError(f"system_id = {system_id}: must be from 1 to 255")
+# Of a fleet, a robot, a site: a part of radio keys and of file names.
+PlainName = Annotated[
+    str,
+    Meta(
+        pattern=r"\A[A-Za-z0-9_][A-Za-z0-9_-]{0,31}\Z",
+        description="1 to 32 letters, digits, '-' and '_', and not start with '-'",
+    ),
+]
+# PX4's MAV_SYS_ID.
+SystemId = Annotated[int, Meta(ge=1, le=255)]
+_LoopRate = Annotated[float, Meta(ge=0.1, le=100.0)]
 
 
 def require_url(key: str, url: str) -> None:
@@ -93,7 +94,7 @@ class SensorConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class AutopilotConfig:
+class AutopilotConfig(Bounded):
     """The vehicle: a `type` of `edge.drivers.registry`, and what that takes.
 
     `url` is where PX4's datagrams come in, e.g. udpin://127.0.0.1:14551; `system_id` which one it
@@ -102,12 +103,12 @@ class AutopilotConfig:
     """
 
     url: str
-    system_id: int
+    system_id: SystemId
     type: str = "px4"
     insecure: bool = False
     options: dict[str, object] = field(default_factory=dict, hash=False)
 
-    def __post_init__(self) -> None:
+    def check_rules(self) -> None:
         if self.type == "px4":
             require_url("url", self.url)
             if not (self.insecure or is_loopback(self.url[len("udpin://") :].rpartition(":")[0])):
@@ -116,7 +117,6 @@ class AutopilotConfig:
                     "must be at 127.0.0.1; where PX4 is at the other end of a wire of its own, say "
                     "insecure = true"
                 )
-        require_system_id(self.system_id)
 
 
 def port_of(url: str) -> int:
@@ -183,23 +183,19 @@ class IdentityConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Rates:
+class Rates(Bounded):
     """How often the three loops run, Hz."""
 
-    perception_hz: float = 5.0
-    policy_hz: float = 2.5
-    control_hz: float = 10.0
-
-    def __post_init__(self) -> None:
-        for name in ("perception_hz", "policy_hz", "control_hz"):
-            if not 0.1 <= getattr(self, name) <= 100.0:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be from 0.1 to 100")
-        if self.control_hz < 4.0:
-            raise ValueError(f"control_hz = {self.control_hz}: PX4 needs setpoints at 4 Hz or more")
+    perception_hz: _LoopRate = 5.0
+    policy_hz: _LoopRate = 2.5
+    control_hz: Annotated[
+        float,
+        Meta(ge=4.0, le=100.0, description="from 4 to 100: PX4 needs setpoints at 4 Hz or more"),
+    ] = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class PolicyConfig:
+class PolicyConfig(Bounded):
     """The bundle, the world it flies over, and the paper's scales.
 
     `payload`: what its messages are encoded as; by default as the smallest of those that the policy
@@ -208,18 +204,11 @@ class PolicyConfig:
 
     bundle: str
     world: str
-    env_scale: float = 16.0
-    velocity_scale: float = 0.25
-    max_message_age_s: float = 0.8
-    max_input_age_s: float = 1.0
+    env_scale: Positive = 16.0
+    velocity_scale: Positive = 0.25
+    max_message_age_s: NonNegative = 0.8
+    max_input_age_s: Positive = 1.0
     payload: Literal["smallest", PayloadType] = "smallest"
-
-    def __post_init__(self) -> None:
-        ModelScale(self.env_scale, self.velocity_scale)
-        if not 0.0 <= self.max_message_age_s < math.inf:
-            raise ValueError(f"max_message_age_s = {self.max_message_age_s}: must be 0 or above")
-        if not 0.0 < self.max_input_age_s < math.inf:
-            raise ValueError(f"max_input_age_s = {self.max_input_age_s}: must be above 0")
 
     def payload_of(self, judged: Sequence[PayloadType]) -> PayloadType:
         """What messages are encoded as, of what the policy was `judged` with.
@@ -237,7 +226,7 @@ class PolicyConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class FailsafeConfig:
+class FailsafeConfig(Bounded):
     """What PX4 does when something fails: for an RC pilot, or for none.
 
     `parameters`: whether wrong PX4 parameters are set, also in flight if somebody else changes
@@ -249,31 +238,23 @@ class FailsafeConfig:
     rc: Literal["pilot", "none"]
     rc_lost: RemoteControlLost = "alarm"
     parameters: Literal["set", "refuse"] = "refuse"
-    fence_margin_m: float = 5.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.fence_margin_m < math.inf:
-            raise ValueError(f"fence_margin_m = {self.fence_margin_m}: must be 0 or above")
+    fence_margin_m: NonNegative = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class LogConfig:
+class LogConfig(Bounded):
     """The flight log's folder and size, MB."""
 
     folder: str = "logs"
-    max_total_mb: float = 2000.0
-
-    def __post_init__(self) -> None:
-        if not 50.0 <= self.max_total_mb < math.inf:
-            raise ValueError(f"max_total_mb = {self.max_total_mb}: must be 50 or more")
+    max_total_mb: Annotated[float, Meta(ge=50.0, le=MAX_FLOAT)] = 2000.0
 
 
 @dataclass(frozen=True, slots=True)
-class RobotConfig:
+class RobotConfig(Bounded):
     """All of robot.toml. `on_stop` is what a stopped program leaves a flying vehicle to do."""
 
-    fleet: str
-    robot_id: int
+    fleet: PlainName
+    robot_id: RobotId
     policy: PolicyConfig
     autopilot: AutopilotConfig
     link: LinkConfig
@@ -292,9 +273,7 @@ class RobotConfig:
     log: LogConfig = field(default_factory=LogConfig)
     on_stop: Literal["hold", "land"] = "hold"
 
-    def __post_init__(self) -> None:
-        require_name("fleet = ", self.fleet)
-        require_robot_id(self.robot_id)
+    def check_rules(self) -> None:
         if self.identity.folder and self.link.insecure:
             raise ValueError("link.insecure = true: not with [identity] folder")
         if self.link.leaves_machine and not (self.identity.folder or self.link.insecure):

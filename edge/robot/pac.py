@@ -25,10 +25,9 @@ from edge.core.memory import RobotMemory
 from edge.core.part import PartError, array_problem, in_one_line
 from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Camera, Odometry, OdometrySource, Sensor
+from edge.core.schema import Bounded, NonNegative, Positive, require
 from edge.core.shared_map import SharedMap
 from edge.core.wire import (
-    MAX_ROBOT_ID,
-    PAYLOAD_TYPES,
     PayloadType,
     Rejection,
     decode,
@@ -38,6 +37,7 @@ from edge.core.wire import (
 from edge.flight.safety import limit_speed
 from edge.identity.envelope import OVERHEAD_BYTES
 from edge.messages.beacon import BEACON_BYTES
+from edge.messages.bounds import RobotId
 from edge.policy.bundle import BundleError
 from edge.policy.family import (
     Observation,
@@ -52,7 +52,7 @@ Position = tuple[float, float, float]  # in the mission frame, m
 
 
 @dataclass(frozen=True, slots=True)
-class PacParameters:
+class PacParameters(Bounded):
     """The fleet's settings of the loop; ages in s, see `Mailbox` for `max_message_age_s`.
 
     Features, and then an action, that are older than `max_input_age_s` are not used: two ticks of
@@ -60,20 +60,10 @@ class PacParameters:
     """
 
     scale: ModelScale
-    max_speed_m_s: float
-    max_message_age_s: float = 0.8
-    max_input_age_s: float = 1.0
+    max_speed_m_s: Positive
+    max_message_age_s: NonNegative = 0.8
+    max_input_age_s: Positive = 1.0
     payload: PayloadType = "float16"
-
-    def __post_init__(self) -> None:
-        for name in ("max_speed_m_s", "max_input_age_s"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{name} = {value}: must be positive and finite")
-        if self.payload not in PAYLOAD_TYPES:
-            raise ValueError(
-                f"payload = {self.payload!r}: must be one of {', '.join(PAYLOAD_TYPES)}"
-            )
 
 
 def message_bytes(policy: Policy, payload: PayloadType) -> tuple[int, int]:
@@ -141,8 +131,7 @@ class Pac:
         parameters: PacParameters,
     ) -> None:
         """Raises BundleError if no robot can fly the policy, ValueError for an impossible id."""
-        if not 0 <= robot_id <= MAX_ROBOT_ID:
-            raise ValueError(f"robot_id = {robot_id}: must be from 0 to {MAX_ROBOT_ID}")
+        require(RobotId, robot_id, "robot_id")
         manifest = policy.manifest
         if manifest.perception is None:
             raise BundleError(

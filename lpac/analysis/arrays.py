@@ -1,7 +1,8 @@
 """Flight logs as numpy arrays: what was recorded, topic by topic, a column for each value.
 
-A flight's record (`lpac.analysis.report.examine`) says what robots did together, on one clock. Here
-is all that one of them wrote, as it wrote it; `edge.drivers.flight_log` has the table of topics.
+A flight's record (`lpac.analysis.examination.examine`) says what robots did together, on one clock.
+Here is all that one of them wrote, as it wrote it; `edge.drivers.flight_log` has the table of
+topics.
 """
 
 import re

@@ -160,11 +160,11 @@ def costs(flights: Sequence[FlightRecord]) -> Figure:
 
 
 def repeatability(flights: Sequence[FlightRecord]) -> Figure:
-    """All trials' cost, their mean and spread; and where the robots ended, trial by trial.
+    """All missions' cost, their mean and spread; and where the robots ended, mission by mission.
 
-    Thin curves are costs where the vehicles truly were, of trials that tell it.
+    Thin curves are costs where the vehicles truly were, of records that tell it.
     """
-    colours = style.trial_colours(len(flights))
+    colours = style.colours_of(len(flights))
     with style.figure(WIDTH_IN, 3.1) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
         end_s = min(flight.duration_s for flight in flights)
@@ -185,7 +185,7 @@ def repeatability(flights: Sequence[FlightRecord]) -> Figure:
             Line2D([], [], color="k", lw=0.8, ls=style.DOTTED, label=f"{LLOYD}, {lloyd:.2f}"),
         ]
         if any(flight.truth for flight in flights):
-            handles.append(Line2D([], [], color=INK, lw=0.4, label="a trial, true cost"))
+            handles.append(Line2D([], [], color=INK, lw=0.4, label="a mission, true cost"))
         left.legend(
             handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2,
             handlelength=1.6, fontsize=7, columnspacing=1.0, borderaxespad=0.2,
@@ -196,7 +196,7 @@ def repeatability(flights: Sequence[FlightRecord]) -> Figure:
         for flight, colour in zip(flights, colours, strict=True):
             places_m = np.array(list(flight.places_at(flight.duration_s).values())).reshape(-1, 2)
             right.plot(*places_m.T, ls="", marker="o", ms=4.5, color=colour, mec="k", mew=0.4)
-        right.set_title("end positions, coloured by trial")
+        right.set_title("end positions, coloured by mission")
         _frame(np.array([[right]]), flights[0], margin=False)
         if len(flights) <= _MOST_NAMES:
             handles = [

@@ -146,7 +146,7 @@ class FirstAlarm(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Messages:
-    """The messages between a trial's robots, while it lasted.
+    """The messages between a mission's robots, while it lasted.
 
     `age_s` and `loss` are (N, N), [receiver, sender]: the median age, and the share that did not
     come of what was sent from the first to the last that did; NaN where nothing came. `heard` are
@@ -178,7 +178,7 @@ class Messages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopLateness:
-    """A loop of one robot over the trial: (T,) time, s, and lateness in the minute before, ms."""
+    """A loop of one robot over the mission: (T,) time, s, and lateness in the minute before, ms."""
 
     time_s: F64
     p50_ms: F64

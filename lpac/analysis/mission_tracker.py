@@ -1,4 +1,4 @@
-"""Which mission is under way: one flight of a trial ends where the next of the same name begins."""
+"""Which mission is under way: one of a name ends where the next begins."""
 
 from typing import NamedTuple, Protocol
 
@@ -21,7 +21,7 @@ class MissionStatus(Protocol):
 
 
 class _Flown(NamedTuple):
-    """Who has flown the mission of a trial; `heard_s` is when it said so last."""
+    """A robot in a mission; `heard_s` is when it said so last."""
 
     trial: str
     boot_nonce: int

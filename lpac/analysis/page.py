@@ -23,7 +23,7 @@ _CAPTIONS = {
     "loops": "How late the loops' ticks were, in the minute before each time.",
 }
 _MOST_ROWS = 30
-_REPEATABILITY = "Cost of all trials, their mean and standard deviation; and end positions."
+_REPEATABILITY = "Cost of all missions, their mean and standard deviation; and end positions."
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -48,9 +48,9 @@ td.number { font-variant-numeric: tabular-nums; white-space: nowrap; }
 
 
 class Drawn(NamedTuple):
-    """A trial, and its figures: PNG by name."""
+    """A flight's record, and its figures: PNG by name."""
 
-    trial: FlightRecord
+    record: FlightRecord
     figures: Mapping[str, bytes]
 
 
@@ -58,22 +58,22 @@ def page(
     title: str, drawn: Sequence[Drawn], repeatability: bytes | None, notes: Iterable[str]
 ) -> str:
     """The page's HTML."""
-    parts = [opening(title), _summary([d.trial for d in drawn])]
+    parts = [opening(title), _summary([d.record for d in drawn])]
     if repeatability is not None:
         parts.append("<h3>Repeatability</h3>")
         parts.append(figure(repeatability, _REPEATABILITY))
     parts += [f'<p class="quiet">{_text(note)}</p>' for note in notes]
-    for number, (trial, figures) in enumerate(drawn, 1):
-        parts.append(f'<h2 id="trial-{number}">{_text(trial.name)}</h2>')
-        parts.append(_about(trial))
+    for number, (record, figures) in enumerate(drawn, 1):
+        parts.append(f'<h2 id="mission-{number}">{_text(record.name)}</h2>')
+        parts.append(_about(record))
         for name, png in figures.items():
             caption = _CAPTIONS[name]
-            if name == "messages" and trial.clocks_known:
+            if name == "messages" and record.clocks_known:
                 caption += " Clocks are corrected, to a few ms."
             parts.append(figure(png, caption, narrow=name == "start-and-end"))
-        parts.append(_robots(trial))
-        parts.append(_alarms(trial))
-        parts.append(_commands(trial))
+        parts.append(_robots(record))
+        parts.append(_alarms(record))
+        parts.append(_commands(record))
     parts.append(CLOSING)
     return "\n".join(part for part in parts if part) + "\n"
 
@@ -94,69 +94,69 @@ def opening(title: str) -> str:
 CLOSING = "</body></html>"
 
 
-def _summary(trials: Sequence[FlightRecord]) -> str:
+def _summary(records: Sequence[FlightRecord]) -> str:
     header = (
-        "trial", "began", "s", "robots", "J at begin", "J at end", "J/J(0)", "Lloyd",
+        "mission", "began", "s", "robots", "J at begin", "J at end", "J/J(0)", "Lloyd",
         "least distance", "inside fence", "messages lost", "alarms", "restarts",
     )  # fmt: skip
     rows = []
-    for number, trial in enumerate(trials, 1):
-        cost, separation = trial.cost, trial.separation
-        lost = math.nan if trial.messages is None else trial.messages.loss_share
+    for number, record in enumerate(records, 1):
+        cost, separation = record.cost, record.separation
+        lost = math.nan if record.messages is None else record.messages.loss_share
         rows.append(
             (
-                f'<a href="#trial-{number}">{_text(trial.name)}</a>',
-                f"{datetime.fromtimestamp(trial.begin_s).astimezone():%Y-%m-%d %H:%M:%S}",
-                f"{trial.duration_s:.0f}",
-                str(len(trial.robots)),
+                f'<a href="#mission-{number}">{_text(record.name)}</a>',
+                f"{datetime.fromtimestamp(record.begin_s).astimezone():%Y-%m-%d %H:%M:%S}",
+                f"{record.duration_s:.0f}",
+                str(len(record.robots)),
                 f"{cost[0]:.3g}" if len(cost) else "",
                 f"{cost[-1]:.3g}" if len(cost) else "",
-                f"{trial.normalized[-1]:.2f}" if len(trial.normalized) else "",
-                _number(trial.normalized_lloyd, "{:.2f}"),
+                f"{record.normalized[-1]:.2f}" if len(record.normalized) else "",
+                _number(record.normalized_lloyd, "{:.2f}"),
                 "" if separation is None else f"{separation.distance_m:.2f} m",
-                _marked(f"{trial.fence_margin_m:.2f} m", trial.fence_margin_m < 0.0)
-                if math.isfinite(trial.fence_margin_m)
+                _marked(f"{record.fence_margin_m:.2f} m", record.fence_margin_m < 0.0)
+                if math.isfinite(record.fence_margin_m)
                 else "",
                 _number(100.0 * lost, "{:.1f} %"),
-                _marked(str(len(trial.alarms)), bool(trial.alarms)),
-                _marked(str(sum(trial.restarts.values())), bool(trial.restarts)),
+                _marked(str(len(record.alarms)), bool(record.alarms)),
+                _marked(str(sum(record.restarts.values())), bool(record.restarts)),
             )
         )
     return table(header, rows, numbers=range(1, len(header)))
 
 
-def _about(trial: FlightRecord) -> str:
+def _about(record: FlightRecord) -> str:
     words = [
-        f"{counted(len(trial.robots), 'robot')}, {trial.duration_s:.0f} s, from "
-        f"{datetime.fromtimestamp(trial.begin_s).astimezone():%Y-%m-%d %H:%M:%S %Z}."
+        f"{counted(len(record.robots), 'robot')}, {record.duration_s:.0f} s, from "
+        f"{datetime.fromtimestamp(record.begin_s).astimezone():%Y-%m-%d %H:%M:%S %Z}."
     ]
-    if trial.separation is not None:
-        one, other = trial.separation.robots
+    if record.separation is not None:
+        one, other = record.separation.robots
         words.append(
-            f"Least distance by the robots' estimates: {trial.separation.distance_m:.2f} m between "
-            f"{one} and {other}, at {trial.separation.time_s:.1f} s."
+            f"Least distance by the robots' estimates: {record.separation.distance_m:.2f} m "
+            f"between {one} and {other}, at {record.separation.time_s:.1f} s."
         )
-    if trial.true_separation is not None:
-        one, other = trial.true_separation.robots
+    if record.true_separation is not None:
+        one, other = record.true_separation.robots
         words.append(
-            f"In truth: {trial.true_separation.distance_m:.2f} m between {one} and {other}, at "
-            f"{trial.true_separation.time_s:.1f} s; {trial.true_fence_margin_m:.2f} m inside the "
-            f"fence; cost at the end {_number(_last(trial.normalized_true), '{:.2f}')} of the "
+            f"In truth: {record.true_separation.distance_m:.2f} m between {one} and {other}, at "
+            f"{record.true_separation.time_s:.1f} s; {record.true_fence_margin_m:.2f} m inside the "
+            f"fence; cost at the end {_number(_last(record.normalized_true), '{:.2f}')} of the "
             "initial."
         )
-    if not trial.clocks_known:
+    if not record.clocks_known:
         words.append("Each robot's times are by its own clock: no ground log has the offsets.")
     return f"<p>{_text(' '.join(words))}</p>"
 
 
-def _robots(trial: FlightRecord) -> str:
+def _robots(record: FlightRecord) -> str:
     header = (
         "robot", "battery at end", *(f"{loop} late, 99 % / max" for loop in LOOPS), "overruns",
         "restarts",
     )  # fmt: skip
     rows = []
-    for robot in trial.robots:
-        late = [trial.lateness[loop].get(robot.name) for loop in LOOPS]
+    for robot in record.robots:
+        late = [record.lateness[loop].get(robot.name) for loop in LOOPS]
         battery = robot.said[-1].battery
         rows.append(
             (
@@ -164,7 +164,7 @@ def _robots(trial: FlightRecord) -> str:
                 "" if battery is None else f"{100.0 * battery:.0f} %",
                 *map(_late, late),
                 str(sum(loop.overruns for loop in late if loop is not None)),
-                str(trial.restarts.get(robot.name, 0)),
+                str(record.restarts.get(robot.name, 0)),
             )
         )
     return "<h3>Robots</h3>" + table(header, rows, numbers=range(1, len(header)))
@@ -174,19 +174,19 @@ def _late(loop: LoopLateness | None) -> str:
     return "" if loop is None else f"{loop.p99_ms[-1]:.1f} / {loop.max_ms[-1]:.1f} ms"
 
 
-def _alarms(trial: FlightRecord) -> str:
-    if not trial.alarms:
+def _alarms(record: FlightRecord) -> str:
+    if not record.alarms:
         return ""
-    rows = [(_time(a.time_s), _text(a.robot), _text(a.text)) for a in trial.alarms]
+    rows = [(_time(a.time_s), _text(a.robot), _text(a.text)) for a in record.alarms]
     return "<h3>Alarms</h3>" + table(("s", "robot", "alarm"), rows, numbers=(0,))
 
 
-def _commands(trial: FlightRecord) -> str:
-    if not trial.commands:
+def _commands(record: FlightRecord) -> str:
+    if not record.commands:
         return ""
     rows = [
         (_time(c.time_s), _text(c.operator), _text(c.robot), _marked(_text(c.text), not c.done))
-        for c in trial.commands
+        for c in record.commands
     ]
     opened = " open" if len(rows) <= _MOST_ROWS else ""
     return (

@@ -111,8 +111,8 @@ def robot_colour(index: int) -> str:
     return _ROBOTS[index % len(_ROBOTS)]
 
 
-def trial_colours(count: int) -> list[str]:
-    """Of trials beside each other; black is their mean."""
+def colours_of(count: int) -> list[str]:
+    """Of missions beside each other; black is their mean."""
     if count < len(CURVES):
         return [colour for colour, _ in CURVES[1 : count + 1]]
     return [to_hex(colour) for colour in mpl.colormaps["viridis"](np.linspace(0.0, 0.9, count))]

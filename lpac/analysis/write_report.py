@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lpac.analysis import figures, style
+from lpac.analysis.examination import Examined
 from lpac.analysis.flight import LOOPS, FlightRecord
 from lpac.analysis.logs import Progress
 from lpac.analysis.page import Drawn, page
-from lpac.analysis.report import Examined
 
 PAGE = "report.html"
 SUMMARY = "report.json"
@@ -22,17 +22,17 @@ def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Pro
     """Write figures, page and summary to `out`; gives the page. Raises OSError."""
     drawn = []
     slugs: set[str] = set()
-    for index, trial in enumerate(examined.trials):
-        progress(f"drawing {trial.name}", index / len(examined.trials))
-        drawn.append(Drawn(trial, _draw(trial, out / _slug(trial.name, slugs), times_s)))
+    for index, record in enumerate(examined.records):
+        progress(f"drawing {record.name}", index / len(examined.records))
+        drawn.append(Drawn(record, _draw(record, out / _slug(record.name, slugs), times_s)))
     repeatability = None
-    with_cost = [trial for trial in examined.trials if len(trial.normalized)]
+    with_cost = [record for record in examined.records if len(record.normalized)]
     if len(with_cost) > 1:
-        progress("drawing all trials", 1.0)
+        progress("drawing all missions", 1.0)
         repeatability = style.save(figures.repeatability(with_cost), out / "repeatability")
         style.save(figures.costs(with_cost), out / "costs")
     (out / SUMMARY).write_text(json.dumps(examined.summary(), indent=2) + "\n")
-    names = ", ".join(trial.name for trial in examined.trials[:3])
+    names = ", ".join(record.name for record in examined.records[:3])
     names += ", …" if len(drawn) > 3 else ""
     text = page(f"Flight report: {names}", drawn, repeatability, examined.notes)
     (out / PAGE).write_bytes(text.encode(errors="backslashreplace"))
@@ -40,8 +40,8 @@ def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Pro
 
 
 def _slug(name: str, taken: set[str]) -> str:
-    """A folder's name that no other trial has."""
-    plain = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "trial"
+    """A folder's name that no other mission has."""
+    plain = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "mission"
     slug = next(
         slug
         for number in range(1, len(taken) + 2)
@@ -51,19 +51,19 @@ def _slug(name: str, taken: set[str]) -> str:
     return slug
 
 
-def _draw(trial: FlightRecord, folder: Path, times_s: Sequence[float]) -> dict[str, bytes]:
+def _draw(record: FlightRecord, folder: Path, times_s: Sequence[float]) -> dict[str, bytes]:
     """PNG by figure."""
-    shown_s = [time_s for time_s in times_s if time_s <= trial.duration_s]
-    shown_s = shown_s or [share * trial.duration_s for share in figures.SNAPSHOTS]
+    shown_s = [time_s for time_s in times_s if time_s <= record.duration_s]
+    shown_s = shown_s or [share * record.duration_s for share in figures.SNAPSHOTS]
     drawn = {
-        "snapshots": figures.snapshots(trial, shown_s),
-        "start-and-end": figures.start_and_end(trial),
+        "snapshots": figures.snapshots(record, shown_s),
+        "start-and-end": figures.start_and_end(record),
     }
-    if len(trial.normalized):
-        drawn["cost"] = figures.costs([trial])
-    drawn["states"] = figures.states(trial)
-    if trial.messages is not None and len(trial.messages.heard_at_s):
-        drawn["messages"] = figures.messages(trial, trial.messages)
-    if any(trial.lateness[loop] for loop in LOOPS):
-        drawn["loops"] = figures.loops(trial)
+    if len(record.normalized):
+        drawn["cost"] = figures.costs([record])
+    drawn["states"] = figures.states(record)
+    if record.messages is not None and len(record.messages.heard_at_s):
+        drawn["messages"] = figures.messages(record, record.messages)
+    if any(record.lateness[loop] for loop in LOOPS):
+        drawn["loops"] = figures.loops(record)
     return {name: style.save(figure, folder / name) for name, figure in drawn.items()}

@@ -15,9 +15,9 @@ from lpac.cli.options import AsJson
 from lpac.cli.printing import print_table, progress_of
 
 if TYPE_CHECKING:
-    from lpac.network.measure import Plan
-    from lpac.network.results import Experiment, Run, Spread, Summary
-    from lpac.network.stations import NetworkStation
+    from lpac.middleware.measure import Plan
+    from lpac.middleware.places import NetworkPlace
+    from lpac.middleware.results import Experiment, Run, Spread, Summary
 
 app = new_app(
     "bench",
@@ -81,7 +81,7 @@ def network(
     out: Annotated[Path, typer.Option(help="Folder for network.json and figures.")] = _OUT,
 ) -> None:
     """The paper's network experiments: what a bulk stream gets beside the robots' programs."""
-    from lpac.network.results import as_json as to_json
+    from lpac.middleware.results import as_json as to_json
     from lpac.train.files import write_atomically
 
     chosen = _checked(middlewares)
@@ -89,10 +89,10 @@ def network(
         _plan(experiment, chosen, robots, repetitions, seconds)
         for experiment in _experiments(experiments)
     ]
-    stations = _stations(namespaces, max(plan.stations for plan in plans))
-    where = _measured_on(stations, plans[0])
+    places = _places(namespaces, max(plan.places for plan in plans))
+    where = _measured_on(places, plans[0])
     runs: list[Run] = []
-    with closing(_measure(plans, stations)) as measured:
+    with closing(_measure(plans, places)) as measured:
         for run in measured:
             runs.append(run)
             # An interrupted measurement leaves what it has.
@@ -106,7 +106,7 @@ def network(
 
 
 def _experiments(given: Sequence[str] | None) -> list["Experiment"]:
-    from lpac.network.results import EXPERIMENTS
+    from lpac.middleware.results import EXPERIMENTS
 
     for name in given or ():
         if name not in EXPERIMENTS:
@@ -116,7 +116,7 @@ def _experiments(given: Sequence[str] | None) -> list["Experiment"]:
 
 def _checked(given: Sequence[str] | None) -> tuple[str, ...]:
     """Those that are installed, and nothing. Raises ValueError."""
-    from lpac.network.middleware import MIDDLEWARES, NOTHING
+    from lpac.middleware.kinds import MIDDLEWARES, NOTHING
 
     for name in given or ():
         if name not in MIDDLEWARES:
@@ -141,7 +141,7 @@ def _plan(
     repetitions: int | None,
     seconds: float | None,
 ) -> "Plan":
-    from lpac.network.measure import Plan
+    from lpac.middleware.measure import Plan
 
     its_robots, its_repetitions, its_seconds = _RESTARTS if experiment == "restarts" else _ROBOTS
     fleet = its_robots if robots is None else robots
@@ -164,11 +164,11 @@ def _plan(
 def require_namespaces(namespaces: str | None, robots: int | None) -> None:
     """Raises ValueError, OSError if all experiments with so many robots could not run there."""
     plans = [_plan(each, (), robots, None, None) for each in _experiments(None)]
-    _stations(namespaces, max(plan.stations for plan in plans))
+    _places(namespaces, max(plan.places for plan in plans))
 
 
-def _stations(namespaces: str | None, needed: int) -> list["NetworkStation"]:
-    from lpac.network.stations import LOOPBACK, station_in
+def _places(namespaces: str | None, needed: int) -> list["NetworkPlace"]:
+    from lpac.middleware.places import LOOPBACK, place_in
 
     if namespaces is None:
         return [LOOPBACK] * needed
@@ -182,14 +182,14 @@ def _stations(namespaces: str | None, needed: int) -> list["NetworkStation"]:
         )
     if len(set(names)) < len(names):
         raise ValueError("--namespaces: one is given twice; each robot needs its own")
-    return [station_in(name) for name in names[:needed]]
+    return [place_in(name) for name in names[:needed]]
 
 
-def _measured_on(stations: Sequence["NetworkStation"], plan: "Plan") -> dict[str, Any]:
-    from lpac.network.middleware import MIDDLEWARES
-    from lpac.network.robot import SIZE_BYTES
+def _measured_on(places: Sequence["NetworkPlace"], plan: "Plan") -> dict[str, Any]:
+    from lpac.middleware.kinds import MIDDLEWARES
+    from lpac.middleware.robot import SIZE_BYTES
 
-    names = [station.namespace for station in stations]
+    names = [place.namespace for place in places]
     return {
         "where": "loopback" if names[0] is None else "namespaces",
         "namespaces": None if names[0] is None else names,
@@ -206,11 +206,11 @@ def _measured_on(stations: Sequence["NetworkStation"], plan: "Plan") -> dict[str
 
 
 def _measure(
-    plans: Sequence["Plan"], stations: Sequence["NetworkStation"]
+    plans: Sequence["Plan"], places: Sequence["NetworkPlace"]
 ) -> "Generator[Run, None, None]":
     """Each run as it is made."""
-    from lpac.network.figures import title_of
-    from lpac.network.measure import measure
+    from lpac.middleware.figures import title_of
+    from lpac.middleware.measure import measure
 
     with progress_of("runs") as progress:
         task = progress.add_task("", total=sum(1 for plan in plans for _ in plan.runs()))
@@ -220,7 +220,7 @@ def _measure(
             progress.update(task, description=doing)
 
         for plan in plans:
-            with closing(measure(plan, stations, tell)) as runs:
+            with closing(measure(plan, places, tell)) as runs:
                 for run in runs:
                     progress.update(task, advance=1)
                     yield run
@@ -228,7 +228,7 @@ def _measure(
 
 def _draw(runs: Sequence["Run"], out: Path) -> None:
     from lpac.analysis import style
-    from lpac.network.figures import of_restarts, over_robots
+    from lpac.middleware.figures import of_restarts, over_robots
 
     for experiment, drawn in (("restarts", of_restarts), ("robots", over_robots)):
         its = [run for run in runs if run.experiment == experiment]
@@ -237,7 +237,7 @@ def _draw(runs: Sequence["Run"], out: Path) -> None:
 
 
 def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
-    from lpac.network.results import left_out, summaries
+    from lpac.middleware.results import left_out, summaries
 
     of_each = summaries(runs)
     restarts = [summary for summary in of_each if summary.experiment == "restarts"]
@@ -251,7 +251,7 @@ def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
     curves = [summary for summary in of_each if summary.experiment == "robots"]
     if curves:
         typer.echo(
-            f"{chr(10) if restarts else ''}throughput between two stations while so many robots' "
+            f"{chr(10) if restarts else ''}throughput between two places while so many robots' "
             "programs run, and how old their messages are when they arrive\n"
         )
         print_table(_CURVE_COLUMNS, [_curve_row(one) for one in curves], _CURVE_COLUMNS[1:])
@@ -279,7 +279,7 @@ _CURVE_COLUMNS = ("", "robots", "Mbit/s", "age p50, ms", "p99, ms", "delivered, 
 
 
 def _restart_row(of: "Summary") -> list[str]:
-    from lpac.network.figures import title_of
+    from lpac.middleware.figures import title_of
 
     told = of.measures
     return [
@@ -295,7 +295,7 @@ def _restart_row(of: "Summary") -> list[str]:
 
 
 def _curve_row(of: "Summary") -> list[str]:
-    from lpac.network.figures import title_of
+    from lpac.middleware.figures import title_of
 
     told = of.measures
     return [

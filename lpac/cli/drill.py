@@ -80,8 +80,8 @@ def drill(
     """Inject faults into a fleet in flight, and judge by the truth whether promises held."""
     from lpac.sim.drill.campaign import Campaign, fly_order
     from lpac.sim.drill.field import DrilledRobots
-    from lpac.sim.drill.report import as_json as to_json
-    from lpac.sim.drill.report import as_junit
+    from lpac.sim.drill.summary import as_json as to_json
+    from lpac.sim.drill.summary import as_junit
 
     chosen = _chosen(faults)
     if listing:
@@ -270,7 +270,7 @@ def _show(outcomes: list["FlightOutcome"], options: str) -> None:
     from edge.core.counted import counted
     from lpac.analysis.statistics import at_most_share
     from lpac.sim.drill.faults import FAULTS
-    from lpac.sim.drill.report import flown_again_by, shown, summaries
+    from lpac.sim.drill.summary import flown_again_by, shown, summaries
 
     rows = []
     for summary in summaries(outcomes):

@@ -20,7 +20,7 @@ from lpac.cli.options import (
     pool_for,
 )
 from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
-from lpac.cli.radio import WifiFile, calibration, link_line, transport_named, wifi_lines
+from lpac.cli.transport import WifiFile, calibration, link_line, transport_named, wifi_lines
 
 if TYPE_CHECKING:
     from rich.text import Text

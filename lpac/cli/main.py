@@ -35,7 +35,7 @@ _COMMANDS = {
     "foxglove": "Show the fleet in Foxglove, live or from logs; or write its layout.",
     "site": "Places to fly at: origin, fence, pads and landing points, beside fleet.toml.",
     "record": "Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs.",
-    "report": "Make figures and an HTML page from flight logs; and how well trials repeat.",
+    "report": "Make figures and an HTML page from flight logs; and how well missions repeat.",
     "replay": "Run policy and flight decisions again on flight logs; say what differs.",
     "fleet": "Deploy to the robots, start and stop them.",
     "export": "Export a trained torch checkpoint as a bundle that runs without torch.",

@@ -252,20 +252,20 @@ def _logged(
     logs: Path, trial: "Sequence[str] | None", world_file: Path | None, bundle: Path | None
 ) -> "dict[str, FlightRecord]":
     """The missions in the logs below a folder, by name. Raises ValueError if one has no cost."""
-    from lpac.analysis.report import Wanted, examine
+    from lpac.analysis.examination import Wanted, examine
 
     wanted = Wanted(
-        trials=tuple(trial or ()), world=world_file, bundle=bundle, world_option="--world-file"
+        missions=tuple(trial or ()), world=world_file, bundle=bundle, world_option="--world-file"
     )
     examined = examine([logs], wanted)
-    for record in examined.trials:
+    for record in examined.records:
         if not len(record.normalized):
             why = [note for note in examined.notes if note.startswith(f"{record.name}: ")]
-            others = "; or choose other missions with --trial" if len(examined.trials) > 1 else ""
+            others = "; or choose other missions with --trial" if len(examined.records) > 1 else ""
             raise ValueError("; ".join(why or [f"{record.name}: no cost is known"]) + others)
     for note in examined.notes:
         typer.echo(f"note: {note}", err=True)
-    return {record.name: record for record in examined.trials}
+    return {record.name: record for record in examined.records}
 
 
 def _beside_points(
@@ -761,7 +761,7 @@ def network(
 ) -> None:
     """Table I, and throughput by number of robots: `lpac bench network` with what is installed."""
     from lpac.cli.bench import network as measure
-    from lpac.network.middleware import MIDDLEWARES
+    from lpac.middleware.kinds import MIDDLEWARES
     from lpac.paper.report import write_network
 
     folder = out or _OUT / "network"

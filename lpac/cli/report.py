@@ -23,7 +23,8 @@ def report(
         Path | None, typer.Option(help="Folder to write to; else `report` in the first DIR.")
     ] = None,
     trial: Annotated[
-        list[str] | None, typer.Option(help="Only this trial; may be repeated. Else all.")
+        list[str] | None,
+        typer.Option(help="Only the mission of this name; may be repeated. Else all."),
     ] = None,
     times: Annotated[
         str | None,
@@ -38,10 +39,12 @@ def report(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Make figures and an HTML page from flight logs; and how well trials repeat."""
-    from lpac.analysis.report import Wanted, examine
+    """Make figures and an HTML page from flight logs; and how well missions repeat."""
+    from lpac.analysis.examination import Wanted, examine
 
-    wanted = Wanted(trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle)
+    wanted = Wanted(
+        missions=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle
+    )
     with progress_of_run() as show:
 
         def tell(what: str, share: float) -> None:
@@ -73,7 +76,7 @@ def _times_s(times: str | None) -> tuple[float, ...]:
 
 
 def _line(values: dict[str, object]) -> str:
-    """A trial in one line."""
+    """A mission in one line."""
 
     from edge.core.counted import counted
 

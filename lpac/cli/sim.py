@@ -28,7 +28,7 @@ from lpac.cli.options import (
     check_px4,
 )
 from lpac.cli.printing import lines_of, progress_of
-from lpac.cli.radio import WifiFile, calibration, link_line, wifi_lines
+from lpac.cli.transport import WifiFile, calibration, link_line, wifi_lines
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from edge.core.schema import ConfigError
+from edge.core.schema import ConfigError, require
 from edge.drivers.identity_folder import (
     AUTHORITY_PEM,
     CERTIFICATE_PEM,
@@ -40,7 +40,7 @@ from edge.drivers.zenoh_link import MAX_CERTIFIED_ID
 from edge.identity.card import MOST_REVOKED, Card, Revocations, Role, signed
 from edge.identity.group import KEY_BYTES
 from edge.identity.signature import Signer, fingerprint
-from edge.robot.config import require_name
+from edge.robot.config import PlainName
 
 _SECRET = "authority.key"
 _MEMBERS = "members.json"
@@ -273,7 +273,7 @@ class Authority:
 
 def create_authority(folder: Path, fleet: str) -> Authority:
     """A new authority. Raises AuthorityError if the folder has one already; OSError."""
-    require_name("fleet = ", fleet)
+    require(PlainName, fleet, "fleet")
     if (folder / _SECRET).exists():
         raise AuthorityError(f"{folder}: has an authority already")
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -12,20 +12,23 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from edge.core.address import host_and_port, ipv4, is_loopback_endpoint, require_host, same_host
 from edge.core.file_errors import in_words
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.schema import Bounded, ConfigError, PointXY, from_mapping
 from edge.flight.margins import Margin, places_apart
+from edge.messages.bounds import RobotId
+from edge.messages.mission import SlotNumber
 from edge.robot.config import (
     AutopilotConfig,
+    PlainName,
     RobotConfig,
+    SystemId,
     port_of,
     require_group,
-    require_name,
-    require_robot_id,
-    require_system_id,
     require_url,
 )
 
@@ -40,9 +43,26 @@ _MAX_CPU = 1023
 _GROUP = "239.255.76.80:7450"
 
 # These stand on the command lines of ssh, and in files of systemd.
-_USER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
-_UNIT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@:-]*")
-_DIRECTORY = re.compile(r"(/[A-Za-z0-9_-][A-Za-z0-9_.-]*)+")
+_User = Annotated[
+    str,
+    Meta(
+        pattern=r"\A[A-Za-z0-9_][A-Za-z0-9_.-]*\Z",
+        description="letters, digits, '.', '-' and '_', and not start with '.' or '-'",
+    ),
+]
+_Unit = Annotated[
+    str,
+    Meta(pattern=r"\A[A-Za-z0-9_][A-Za-z0-9_.@:-]*\Z", description="a container's or unit's name"),
+]
+_Directory = Annotated[
+    str,
+    Meta(
+        pattern=r"\A(/[A-Za-z0-9_-][A-Za-z0-9_.-]*)+\Z",
+        description="an absolute path of letters, digits, '.', '-' and '_', such as '/opt/lpac'",
+    ),
+]
+_Path = Annotated[str, Meta(min_length=1, description="a path")]
+_Port = Annotated[int, Meta(ge=1, le=65535)]
 _CPUS = re.compile(r"([0-9]{1,4})(?:-([0-9]{1,4}))?")
 
 # Keys of robot.toml that [robot] must not have, and where they come from.
@@ -65,19 +85,15 @@ _OF_ONE_ROBOT_ELSEWHERE = _ELSEWHERE | {
 
 
 @dataclass(frozen=True, slots=True)
-class SshConfig:
+class SshConfig(Bounded):
     """`config` is the file for `ssh -F`; empty: OpenSSH's own files."""
 
     config: str = ""
-    connect_timeout_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        if not 1.0 <= self.connect_timeout_s <= 300.0:
-            raise ValueError(f"connect_timeout_s = {self.connect_timeout_s}: must be from 1 to 300")
+    connect_timeout_s: Annotated[float, Meta(ge=1.0, le=300.0)] = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class RadioConfig:
+class RadioConfig(Bounded):
     """How what robots say gets to the others.
 
     "mesh": each is connected to each, and says it to them one by one. "router": all are connected
@@ -90,10 +106,12 @@ class RadioConfig:
     transport: Transport = "mesh"
     router: str = ""
     group: str = _GROUP
-    type: str = "zenoh"
+    type: Annotated[
+        str, Meta(min_length=1, description="'zenoh', or the name of a radio of your own")
+    ] = "zenoh"
     options: dict[str, object] = field(default_factory=dict, hash=False)
 
-    def __post_init__(self) -> None:
+    def check_rules(self) -> None:
         if self.router and not _is_endpoint(self.router):
             raise ValueError(
                 f"router = {self.router!r}: must be a computer's own IPv4 address and a port from "
@@ -108,32 +126,22 @@ class RadioConfig:
             raise ValueError(
                 f"transport = {self.transport!r}: group = {self.group!r}: must be left out"
             )
-        if not self.type:
-            raise ValueError("type = '': must be 'zenoh', or the name of a radio of your own")
         if self.options and self.type == "zenoh":
             raise ValueError(f"options = {self.options}: type = 'zenoh' takes none")
 
 
 @dataclass(frozen=True, slots=True)
-class Slot:
+class Slot(Bounded):
     """A place in the flight; `robot` is None where it is free.
 
     `height` is robot.toml's `flight.slot`; `pad_m` and `landing_point_m` are (x, y) of the mission
     frame.
     """
 
-    height: int
-    pad_m: tuple[float, ...]
-    landing_point_m: tuple[float, ...]
+    height: SlotNumber
+    pad_m: PointXY
+    landing_point_m: PointXY
     robot: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.height < 0:
-            raise ValueError(f"height = {self.height}: must be 0 or above")
-        for name in ("pad_m", "landing_point_m"):
-            place_m = getattr(self, name)
-            if len(place_m) != 2 or not all(map(math.isfinite, place_m)):
-                raise ValueError(f"{name} = {list(place_m)}: must be [x, y]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,35 +302,23 @@ def select(config: FleetConfig, names: str | None) -> list[RobotHost]:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotTable:
+class RobotTable(Bounded):
     """[robots.NAME] as it is written."""
 
     host: str
-    robot_id: int
-    user: str = "root"
-    port: int | None = None
+    robot_id: RobotId
+    user: _User = "root"
+    port: _Port | None = None
     address: str | None = None
-    zenoh_port: int = 7447
-    system_id: int | None = None
+    zenoh_port: _Port = 7447
+    system_id: SystemId | None = None
     mavlink_url: str | None = None
     cpus: str = ""
     robot: dict = field(default_factory=dict)  # type: ignore[type-arg]
 
-    def __post_init__(self) -> None:
+    def check_rules(self) -> None:
         require_host("host", self.host)
-        if _USER.fullmatch(self.user) is None:
-            raise ValueError(
-                f"user = {self.user!r}: must be letters, digits, '.', '-' and '_', and not start "
-                "with '.' or '-'"
-            )
-        for name in ("port", "zenoh_port"):
-            value = getattr(self, name)
-            if value is not None and not 1 <= value <= 65535:
-                raise ValueError(f"{name} = {value}: must be from 1 to 65535")
-        require_robot_id(self.robot_id)
-        if self.system_id is not None:
-            require_system_id(self.system_id)
-        elif not 1 <= self.robot_id <= 255:
+        if self.system_id is None and not 1 <= self.robot_id <= 255:
             raise ValueError(
                 f"system_id is missing: robot_id = {self.robot_id} is not from 1 to 255"
             )
@@ -339,40 +335,26 @@ class RobotTable:
 
 
 @dataclass(frozen=True, slots=True)
-class FleetTable:
+class FleetTable(Bounded):
     """fleet.toml as it is written."""
 
-    fleet: str
-    image: str
-    bundle: str
-    world: str
-    directory: str = DEFAULT_DIRECTORY
-    predecessors: tuple[str, ...] = ()
+    fleet: PlainName
+    image: _Path
+    bundle: _Path
+    world: _Path
+    directory: _Directory = DEFAULT_DIRECTORY
+    predecessors: tuple[_Unit, ...] = ()
     keys: str = ""
     insecure: bool = False
     ssh: SshConfig = field(default_factory=SshConfig)
     radio: RadioConfig = field(default_factory=RadioConfig)
     robot: dict = field(default_factory=dict)  # type: ignore[type-arg]
-    robots: dict = field(default_factory=dict)  # type: ignore[type-arg]
+    robots: dict[PlainName, object] = field(default_factory=dict)
     slots: tuple[Slot, ...] = ()
 
-    def __post_init__(self) -> None:
-        require_name("fleet = ", self.fleet)
+    def check_rules(self) -> None:
         if self.insecure and self.keys:
             raise ValueError("insecure = true: not with keys: leave one of them out")
-        for name in ("image", "bundle", "world"):
-            if not getattr(self, name):
-                raise ValueError(f"{name} = '': must be a path")
-        if _DIRECTORY.fullmatch(self.directory) is None:
-            raise ValueError(
-                f"directory = {self.directory!r}: must be an absolute path of letters, digits, "
-                "'.', '-' and '_', such as '/opt/lpac'"
-            )
-        for name in self.predecessors:
-            if _UNIT.fullmatch(name) is None:
-                raise ValueError(f"predecessors: {name!r}: must be a container's or unit's name")
-        for name in self.robots:
-            require_name("robots: ", name)
 
 
 def read_fleet(path: Path) -> str:

@@ -10,13 +10,16 @@ import tomllib
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
+
+from msgspec import Meta
 
 from edge.core.file_errors import in_words
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.frames import Latitude, Longitude
+from edge.core.schema import Bounded, ConfigError, NonNegative, from_mapping
 from edge.core.world import has_importance, parse_world
 from edge.messages.codes import texts
-from edge.messages.mission import FlightState, GroundState, Origin, RobotStatus
+from edge.messages.mission import FlightState, GroundState, Heading, Origin, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.procedure import Ground, Procedure, Until, fresh_snapshot, gather
 from lpac.ground.site import SavedSite, Sites, origin_at, places_at, standing
@@ -51,22 +54,23 @@ _REJOIN_WITHIN_S = 15.0
 _PERIOD_S = 0.2
 # What is due in less, by rounding, would never come on a clock that is counted.
 _LEAST_S = 0.01
+_Duration = Annotated[float, Meta(gt=0.0, le=36000.0)]
 
 # The file
 
 
 @dataclass(frozen=True, slots=True)
-class OriginStep:
+class OriginStep(Bounded):
     """Set the mission's origin: as given, or as `lpac mission origin --from` measures it."""
 
-    latitude_deg: float | None = None
-    longitude_deg: float | None = None
-    heading_deg: float | None = None
+    latitude_deg: Latitude | None = None
+    longitude_deg: Longitude | None = None
+    heading_deg: Heading | None = None
     from_robot: str = ""
     toward_robot: str = ""
-    average_s: float = 5.0
+    average_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 5.0
 
-    def __post_init__(self) -> None:
+    def check_rules(self) -> None:
         given = (self.latitude_deg, self.longitude_deg, self.heading_deg)
         if self.from_robot and given != (None, None, None):
             raise ValueError(
@@ -77,9 +81,6 @@ class OriginStep:
             raise ValueError(
                 "latitude_deg, longitude_deg and heading_deg must be given, or from_robot"
             )
-        if not 0.0 < self.average_s <= 600.0:
-            raise ValueError(f"average_s = {self.average_s}: must be above 0, and at most 600")
-        self.given()
 
     def given(self) -> Origin | None:
         """The origin as it is written; None if it is to be measured."""
@@ -103,51 +104,43 @@ class WorldStep:
 
 
 @dataclass(frozen=True, slots=True)
-class PreflightStep:
+class PreflightStep(Bounded):
     """Enable the robots, and wait until all are ready."""
 
-    at_most_s: float = 60.0
-
-    def __post_init__(self) -> None:
-        _check_duration("at_most_s", self.at_most_s)
+    at_most_s: _Duration = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class TakeoffStep:
+class TakeoffStep(Bounded):
     """Take off, one after another."""
 
-    interval_s: float = 2.0
+    interval_s: Annotated[float, Meta(ge=0.0, le=60.0)] = 2.0
     abort_on_failure: bool = True
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.interval_s <= 60.0:
-            raise ValueError(f"interval_s = {self.interval_s}: must be from 0 to 60")
 
 
 @dataclass(frozen=True, slots=True)
-class Perturbation:
+class Perturbation(Bounded):
     """At that time of the mission, give a robot to a pilot, or take it back into the mission."""
 
-    at_s: float
+    at_s: NonNegative
     robot: str
     do: Literal["pilot", "rejoin"]
 
 
 @dataclass(frozen=True, slots=True)
-class MissionStep:
+class MissionStep(Bounded):
     """Fly the mission; `restart`: robots that come to hold by themselves are started again."""
 
-    duration_s: float
+    duration_s: _Duration
     restart: bool = False
     perturb: tuple[Perturbation, ...] = ()
 
-    def __post_init__(self) -> None:
-        _check_duration("duration_s", self.duration_s)
+    def check_rules(self) -> None:
         for perturbation in self.perturb:
-            if not 0.0 <= perturbation.at_s < self.duration_s:
+            if not perturbation.at_s < self.duration_s:
                 raise ValueError(
-                    f"perturb: at_s = {perturbation.at_s}: must be 0 or above, and below "
-                    f"duration_s = {self.duration_s}"
+                    f"perturb: at_s = {perturbation.at_s}: must be below duration_s = "
+                    f"{self.duration_s}"
                 )
         given: set[str] = set()
         for perturbation in self.in_time():
@@ -187,24 +180,23 @@ _NAMES = {kind: name for name, kind in (STEPS_BEFORE | STEPS).items()}
 
 
 @dataclass(frozen=True, slots=True)
-class ScriptTable:
+class ScriptTable(Bounded):
     """The file as it is written."""
 
-    trial: str = ""
-    trials: int = 1
+    trial: Annotated[
+        str,
+        Meta(
+            pattern=r"\A[A-Za-z0-9_-]{0,24}\Z",
+            description="at most 24 letters, digits, '-' and '_'",
+        ),
+    ] = ""
+    trials: Annotated[int, Meta(ge=1, le=1000)] = 1
     robots: tuple[str, ...] = ()
     before: tuple[dict, ...] = ()  # type: ignore[type-arg]
-    steps: tuple[dict, ...] = ()  # type: ignore[type-arg]
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.trials <= 1000:
-            raise ValueError(f"trials = {self.trials}: must be from 1 to 1000")
-        if self.trial and re.fullmatch(r"[A-Za-z0-9_-]{1,24}", self.trial) is None:
-            raise ValueError(
-                f"trial = {self.trial!r}: must be 1 to 24 letters, digits, '-' and '_'"
-            )
-        if not self.steps:
-            raise ValueError("steps: none are given: write [[steps]] tables")
+    steps: Annotated[
+        tuple[dict, ...],  # type: ignore[type-arg]
+        Meta(min_length=1, description="one or more [[steps]] tables"),
+    ] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,11 +290,6 @@ def _check_order(steps: Sequence[Step], where: str) -> None:
     if not isinstance(steps[-1], ReturnStep | LandStep):
         last = _NAMES[type(steps[-1])]
         raise ConfigError(f"{where}: the last step is {last!r}: must be 'return' or 'land'")
-
-
-def _check_duration(name: str, value_s: float) -> None:
-    if not 0.0 < value_s <= 36000.0:
-        raise ValueError(f"{name} = {value_s}: must be above 0, and at most 36000")
 
 
 # Flying it

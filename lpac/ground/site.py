@@ -17,10 +17,10 @@ from geographiclib.geodesic import Geodesic
 
 from edge.core.fence import Fence
 from edge.core.file_errors import in_words
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.schema import Bounded, ConfigError, PointXY, from_mapping, require
 from edge.flight.margins import ErrorBudget, places_apart
-from edge.messages.mission import GroundState, Origin, Place, RobotStatus
-from edge.robot.config import require_name
+from edge.messages.mission import GroundState, Origin, Place, RobotStatus, SlotNumber
+from edge.robot.config import PlainName
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 
 # Beyond these a robot does not stand still, or does not know where it is.
@@ -318,20 +318,12 @@ def wide_fence(configured: Fence) -> Fence:
 
 
 @dataclass(frozen=True, slots=True)
-class SiteSlot:
+class SiteSlot(Bounded):
     """A place in the flight: its height's number, where it starts, and where it lands, (x, y)."""
 
-    height: int
-    pad_m: tuple[float, ...]
-    landing_point_m: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if self.height < 0:
-            raise ValueError(f"height = {self.height}: must be 0 or above")
-        for name in ("pad_m", "landing_point_m"):
-            point_m = getattr(self, name)
-            if len(point_m) != 2 or not all(map(math.isfinite, point_m)):
-                raise ValueError(f"{name} = {list(point_m)}: must be [x, y]")
+    height: SlotNumber
+    pad_m: PointXY
+    landing_point_m: PointXY
 
 
 @dataclass(frozen=True, slots=True)
@@ -427,7 +419,7 @@ class Sites:
     def path(self, name: str) -> Path:
         """The file of a site."""
         try:
-            require_name("site ", name)
+            require(PlainName, name, "site")
         except ValueError as error:
             raise ConfigError(str(error)) from None
         return self.folder / f"{name}.toml"

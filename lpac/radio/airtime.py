@@ -23,8 +23,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple, get_args
 
+from msgspec import Meta
+
+from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, NonNegative, Positive, require
 from edge.core.wire import PayloadType
 from edge.identity.group import DATAGRAM_BYTES, PART_BYTES
 from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATUS, state_hz
@@ -81,7 +84,7 @@ def state_bytes(robots: float) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wifi:
+class Wifi(Bounded):
     """One channel and its access point.
 
     `data_rate_mbit_s` is what stations and access point send frames to one receiver at,
@@ -95,22 +98,15 @@ class Wifi:
     Raises ValueError that names an impossible value.
     """
 
-    data_rate_mbit_s: float = 220.0
-    multicast_rate_mbit_s: float = 6.0
-    frame_loss: float = 0.05
-    queue_s: float = 0.3
+    data_rate_mbit_s: Positive = 220.0
+    multicast_rate_mbit_s: Positive = 6.0
+    frame_loss: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.05
+    queue_s: NonNegative = 0.3
     ground_wired: bool = True
-
-    def __post_init__(self) -> None:
-        for name in ("data_rate_mbit_s", "multicast_rate_mbit_s"):
-            _require_positive(name, getattr(self, name))
-        if not 0.0 <= self.frame_loss < 1.0:
-            raise ValueError(f"frame_loss = {self.frame_loss}: must be at least 0 and below 1")
-        _require_not_negative("queue_s", self.queue_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Traffic:
+class Traffic(Bounded):
     """What a fleet says in flight; sizes are those of sealed messages, before any framing.
 
     `message_bytes` and `message_hz` are of what a robot tells its neighbours, `status_hz` of what
@@ -122,21 +118,12 @@ class Traffic:
     Raises ValueError that names an impossible value.
     """
 
-    robots: int
-    message_bytes: float = MESSAGE_BYTES["float16"]
-    message_hz: float = MESSAGE.rate_hz
-    status_hz: float = STATUS.rate_hz
-    neighbours: float | None = None
-    guests: int = 0
-
-    def __post_init__(self) -> None:
-        if self.robots < 1:
-            raise ValueError(f"robots = {self.robots}: must be at least 1")
-        _require_positive("message_bytes", self.message_bytes)
-        for name in ("message_hz", "status_hz", "guests"):
-            _require_not_negative(name, getattr(self, name))
-        if self.neighbours is not None:
-            _require_not_negative("neighbours", self.neighbours)
+    robots: AtLeastOne
+    message_bytes: Positive = MESSAGE_BYTES["float16"]
+    message_hz: NonNegative = MESSAGE.rate_hz
+    status_hz: NonNegative = STATUS.rate_hz
+    neighbours: NonNegative | None = None
+    guests: AtLeastZero = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +179,7 @@ def carries(
     that is not above 0 and finite.
     """
     _require_possible(transport, traffic)
-    _require_positive("most", most)
+    require(Positive, most, "most")
     few, many = 0, most_robots + 1
     while many - few > 1:
         robots = (few + many) // 2
@@ -211,8 +198,8 @@ def guests_around(robots: int, *, of: int, per_m2: float, range_m: float) -> int
     """
     if not 1 <= robots <= of:
         raise ValueError(f"robots = {robots}: must be from 1 to {of}, the fleet's")
-    _require_positive("per_m2", per_m2)
-    _require_not_negative("range_m", range_m)
+    require(Positive, per_m2, "per_m2")
+    require(NonNegative, range_m, "range_m")
     side_m = math.sqrt(robots / per_m2)
     around = per_m2 * (4.0 * side_m * range_m + math.pi * range_m**2)
     return min(of - robots, round(around))
@@ -233,7 +220,7 @@ def cells(
     robot takes more. A cell is sent what `guests_around` it say, and `traffic.guests` is not looked
     at. Raises what `airtime`, `carries` and `guests_around` do.
     """
-    _require_positive("most", most)
+    require(Positive, most, "most")
     if airtime(transport, wifi, replace(traffic, guests=0)).total <= most:
         return 1
     for number in range(2, traffic.robots + 1):
@@ -303,20 +290,9 @@ def _queue(transport: Transport, wifi: Wifi, traffic: Traffic) -> tuple[float, A
 
 
 def _require_possible(transport: Transport, traffic: Traffic) -> None:
-    if transport not in TRANSPORTS:
-        raise ValueError(f"transport = {transport!r}: must be one of {', '.join(TRANSPORTS)}")
+    require(Transport, transport, "transport")
     if transport == "mesh" and traffic.guests:
         raise ValueError(f"guests = {traffic.guests}: must be 0 in a mesh, which has one channel")
-
-
-def _require_positive(name: str, value: float) -> None:
-    if not 0.0 < value < math.inf:
-        raise ValueError(f"{name} = {value}: must be above 0 and finite")
-
-
-def _require_not_negative(name: str, value: float) -> None:
-    if not 0.0 <= value < math.inf:
-        raise ValueError(f"{name} = {value}: must be at least 0 and finite")
 
 
 def _waiting(load: float) -> float:

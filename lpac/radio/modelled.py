@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, field
 
+from edge.core.schema import Bounded
 from edge.core.wire import PayloadType
 from edge.messages.topics import MESSAGE
 from lpac.radio.airtime import (
     MESSAGE_BYTES,
-    TRANSPORTS,
     LinkQuality,
     Traffic,
     Transport,
@@ -16,7 +16,7 @@ from lpac.radio.airtime import (
 
 
 @dataclass(frozen=True, slots=True)
-class ModelledRadio:
+class ModelledRadio(Bounded):
     """How a team's messages travel: all of it shares one channel and reaches its access point.
 
     So whoever flies takes airtime, from the first to the last second, wherever it is: a field of
@@ -27,12 +27,6 @@ class ModelledRadio:
 
     transport: Transport
     wifi: Wifi = field(default_factory=Wifi)
-
-    def __post_init__(self) -> None:
-        if self.transport not in TRANSPORTS:
-            raise ValueError(
-                f"transport = {self.transport!r}: must be one of {', '.join(TRANSPORTS)}"
-            )
 
     def link(
         self, robots: int, payload: PayloadType, message_hz: float = MESSAGE.rate_hz

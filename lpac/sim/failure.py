@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import Bools
+from edge.core.schema import Bounded, NonNegative
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class Failure(Bounded):
     """A robot is out of the swarm from `from_s` on until `until_s`; s since the start.
 
     It stands still, hears and says nothing, and does not count for the cost. It comes back as a
@@ -22,14 +23,14 @@ class Failure:
     """
 
     robot: int
-    from_s: float
+    from_s: NonNegative
     until_s: float = math.inf
 
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.from_s < self.until_s:
+    def check_rules(self) -> None:
+        if not self.from_s < self.until_s:
             raise ValueError(
-                f"failure of robot {self.robot}: from_s = {self.from_s}, until_s = {self.until_s}: "
-                "must be at least 0, and until_s later"
+                f"failure of robot {self.robot}: until_s = {self.until_s}: must be after from_s = "
+                f"{self.from_s}"
             )
 
     @classmethod

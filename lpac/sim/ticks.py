@@ -1,18 +1,20 @@
 """When the loops of a swarm's robots tick."""
 
 import heapq
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+from msgspec import Meta
+
+from edge.core.schema import Bounded, Positive
 
 Loop = Literal["perception", "policy", "control"]
 
 
 @dataclass(frozen=True, slots=True)
-class Clocks:
+class Clocks(Bounded):
     """Periods of a robot's three loops, s; a tick is early or late by up to `jitter` periods.
 
     With `synchronous` all robots' loops begin at once, and none is ever early or late.
@@ -20,18 +22,11 @@ class Clocks:
     Raises ValueError that names what is impossible.
     """
 
-    perception_s: float = 0.2
-    policy_s: float = 0.4
-    control_s: float = 0.1
-    jitter: float = 0.05
+    perception_s: Positive = 0.2
+    policy_s: Positive = 0.4
+    control_s: Positive = 0.1
+    jitter: Annotated[float, Meta(ge=0.0, lt=0.5)] = 0.05
     synchronous: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("perception_s", "policy_s", "control_s"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be positive and finite")
-        if not 0.0 <= self.jitter < 0.5:
-            raise ValueError(f"jitter = {self.jitter}: must be at least 0 and below 0.5")
 
 
 class LoopTick(NamedTuple):

@@ -1,17 +1,27 @@
 """What `lpac train` is told: a TOML file, as frozen dataclasses. Units are the model's, and s."""
 
 import hashlib
-import math
-import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 from edge.core.file_errors import in_words
 from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.schema import (
+    MAX_FLOAT,
+    AtLeastOne,
+    AtLeastZero,
+    Bounded,
+    ConfigError,
+    NonNegative,
+    Share,
+    from_mapping,
+    require,
+)
 from edge.core.world import MOST_FEATURES
 from edge.policy.bundle import Training
 from export.parameters import PolicyParameters
@@ -21,70 +31,62 @@ from lpac.sim.scenario import MAX_ROBOTS
 from lpac.sim.ticks import Clocks
 from lpac.train.family import Learnable, StateDict, learnable
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-
 ExpertName = Literal["clairvoyant-cvt", "best-of-lloyd", "exploring-cvt"]
+# Of something that has files.
+FileName = Annotated[
+    str,
+    Meta(
+        pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]*\Z",
+        description="letters, digits and _ . -, the first of the two",
+    ),
+]
+_Duration = Annotated[float, Meta(ge=1.0, le=3600.0)]
+_LearningRate = Annotated[float, Meta(gt=0.0, le=1.0)]
+_AboveOne = Annotated[float, Meta(ge=1.0, le=MAX_FLOAT)]
+_Robots = Annotated[int, Meta(ge=1, le=MAX_ROBOTS)]
+_LostRobots = Annotated[int, Meta(ge=0, le=MAX_ROBOTS - 1)]
+_WorldSize = Annotated[int, Meta(ge=64, le=8192)]
+_Features = Annotated[int, Meta(ge=1, le=MOST_FEATURES)]
+_PAIR = Meta(min_length=2, max_length=2, description="[least, greatest]")
 
 
 def require_name(name: str) -> None:
     """Of something that has files. Raises ValueError."""
-    if not _NAME.fullmatch(name):
-        raise ValueError(
-            f"name = {name!r}: must be letters, digits and _ . -, the first of the two"
-        )
+    require(FileName, name, "name")
 
 
-def _at_least(least: float, **values: float) -> None:
-    for name, value in values.items():
-        if not least <= value < math.inf:
-            raise ValueError(f"{name} = {value}: must be at least {least:g} and finite")
-
-
-def _share(**values: float) -> None:
-    for name, value in values.items():
-        if not 0.0 <= value <= 1.0:
-            raise ValueError(f"{name} = {value}: must be from 0 to 1")
-
-
-def _duration(duration_s: float) -> None:
-    if not 1.0 <= duration_s <= 3600.0:
-        raise ValueError(f"duration_s = {duration_s}: must be from 1 to 3600")
-
-
-def _range(least: float, most: float = math.inf, **ranges: tuple[float, ...]) -> None:
-    for name, values in ranges.items():
-        if len(values) != 2 or not least <= values[0] <= values[1] <= most or values[1] == math.inf:
-            upto = "" if most == math.inf else f" and at most {most:g}"
-            raise ValueError(
-                f"{name} = {list(values)}: must be [least, greatest], at least {least:g}{upto}"
-            )
+def _require_ordered(**ranges: tuple[float, ...]) -> None:
+    for name, (least, greatest) in ranges.items():
+        if least > greatest:
+            raise ValueError(f"{name} = {[least, greatest]}: must be [least, greatest]")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WorldRanges:
+class WorldRanges(Bounded):
     """Worlds, and the swarms in them: each flight draws from [least, greatest] of each.
 
     `weight` is how often these worlds are drawn, beside others.
     """
 
-    weight: float = 1.0
-    robots: tuple[int, ...] = (10, 10)
-    world_size: tuple[int, ...] = (512, 512)
-    communication_range: tuple[float, ...] = (256.0, 256.0)
-    features: tuple[int, ...] = (10, 10)
-    sigma: tuple[float, ...] = (40.0, 60.0)
+    weight: NonNegative = 1.0
+    robots: Annotated[tuple[_Robots, ...], _PAIR] = (10, 10)
+    world_size: Annotated[tuple[_WorldSize, ...], _PAIR] = (512, 512)
+    communication_range: Annotated[tuple[_AboveOne, ...], _PAIR] = (256.0, 256.0)
+    features: Annotated[tuple[_Features, ...], _PAIR] = (10, 10)
+    sigma: Annotated[tuple[_AboveOne, ...], _PAIR] = (40.0, 60.0)
 
-    def __post_init__(self) -> None:
-        _at_least(0.0, weight=self.weight)
-        _range(1, MAX_ROBOTS, robots=self.robots)
-        _range(64, 8192, world_size=self.world_size)
-        _range(1.0, communication_range=self.communication_range)
-        _range(1, MOST_FEATURES, features=self.features)
-        _range(1.0, sigma=self.sigma)
+    def check_rules(self) -> None:
+        _require_ordered(
+            robots=self.robots,
+            world_size=self.world_size,
+            communication_range=self.communication_range,
+            features=self.features,
+            sigma=self.sigma,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Disturbances:
+class Disturbances(Bounded):
     """What goes wrong in flights; each draws from [least, greatest].
 
     `loss` is the probability with which a message is lost, `delay_s` its way, `lag_s` the time
@@ -93,22 +95,25 @@ class Disturbances:
     comes back with the probability `come_back`.
     """
 
-    loss: tuple[float, ...] = (0.0, 0.0)
-    delay_s: tuple[float, ...] = (0.0, 0.0)
-    lag_s: tuple[float, ...] = (0.0, 0.0)
-    position_bias: tuple[float, ...] = (0.0, 0.0)
-    lost_robots: tuple[int, ...] = (0, 0)
-    come_back: float = 0.0
+    loss: Annotated[tuple[Share, ...], _PAIR] = (0.0, 0.0)
+    delay_s: Annotated[tuple[NonNegative, ...], _PAIR] = (0.0, 0.0)
+    lag_s: Annotated[tuple[NonNegative, ...], _PAIR] = (0.0, 0.0)
+    position_bias: Annotated[tuple[NonNegative, ...], _PAIR] = (0.0, 0.0)
+    lost_robots: Annotated[tuple[_LostRobots, ...], _PAIR] = (0, 0)
+    come_back: Share = 0.0
 
-    def __post_init__(self) -> None:
-        _range(0.0, 1.0, loss=self.loss)
-        _range(0.0, delay_s=self.delay_s, lag_s=self.lag_s, position_bias=self.position_bias)
-        _range(0, MAX_ROBOTS - 1, lost_robots=self.lost_robots)
-        _share(come_back=self.come_back)
+    def check_rules(self) -> None:
+        _require_ordered(
+            loss=self.loss,
+            delay_s=self.delay_s,
+            lag_s=self.lag_s,
+            position_bias=self.position_bias,
+            lost_robots=self.lost_robots,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DataConfig:
+class DataConfig(Bounded):
     """The flights of the first data, which the expert flies; of every flight `states` are kept.
 
     The expert soon is where it wants to be: short flights show most of it. `lloyd_runs` are those
@@ -117,27 +122,24 @@ class DataConfig:
     less than each of it, is still fast.
     """
 
-    flights: int
-    states: int = 20
-    duration_s: float = 20.0
+    flights: AtLeastOne
+    states: AtLeastOne = 20
+    duration_s: _Duration = 20.0
     expert: ExpertName = "clairvoyant-cvt"
-    lloyd_runs: int = 10
-    overshoot: float = 1.0
+    lloyd_runs: AtLeastOne = 10
+    overshoot: _AboveOne = 1.0
     scale: ModelScale = FIELD_SCALE
     clocks: Clocks = field(default_factory=Clocks)
     worlds: tuple[WorldRanges, ...] = (WorldRanges(),)
     disturbances: Disturbances = field(default_factory=Disturbances)
 
-    def __post_init__(self) -> None:
-        _at_least(1, flights=self.flights, states=self.states, lloyd_runs=self.lloyd_runs)
-        _at_least(1, overshoot=self.overshoot)
-        _duration(self.duration_s)
+    def check_rules(self) -> None:
         if not sum(worlds.weight for worlds in self.worlds) > 0.0:
             raise ValueError("worlds: the weights must not all be 0")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FitConfig:
+class FitConfig(Bounded):
     """Imitation of the expert: `epochs` over the first data, in batches of about `batch_robots`.
 
     `begin_with` is a checkpoint that is trained on, its path from the configuration's folder; if
@@ -147,86 +149,62 @@ class FitConfig:
     and turned at random. `bf16` computes in it where the machine does.
     """
 
-    epochs: int
-    batch_robots: int = 640
-    learning_rate: float = 1e-3
-    weight_decay: float = 1e-4
-    lost_messages: float = 0.0
+    epochs: AtLeastOne
+    batch_robots: Annotated[int, Meta(ge=2)] = 640
+    learning_rate: _LearningRate = 1e-3
+    weight_decay: NonNegative = 1e-4
+    lost_messages: Share = 0.0
     symmetries: bool = True
     bf16: bool = True
     begin_with: str | None = None
 
-    def __post_init__(self) -> None:
-        _at_least(1, epochs=self.epochs)
-        _at_least(2, batch_robots=self.batch_robots)
-        _at_least(0.0, weight_decay=self.weight_decay)
-        if not 0.0 < self.learning_rate <= 1.0:
-            raise ValueError(f"learning_rate = {self.learning_rate}: must be above 0 and at most 1")
-        _share(lost_messages=self.lost_messages)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DaggerConfig:
+class DaggerConfig(Bounded):
     """Rounds in which the policy flies, and the expert says what it should have done.
 
     Of the `flights` of a round the expert flies the share `expert_flights`. `learning_rate` is the
     share of fit's with which a round begins.
     """
 
-    rounds: int = 0
-    flights: int = 1
-    duration_s: float = 60.0
-    epochs: int = 1
-    expert_flights: float = 0.0
-    learning_rate: float = 0.5
-
-    def __post_init__(self) -> None:
-        _at_least(0, rounds=self.rounds)
-        _at_least(1, flights=self.flights, epochs=self.epochs)
-        _duration(self.duration_s)
-        _share(expert_flights=self.expert_flights)
-        if not 0.0 < self.learning_rate <= 1.0:
-            raise ValueError(f"learning_rate = {self.learning_rate}: must be above 0 and at most 1")
+    rounds: AtLeastZero = 0
+    flights: AtLeastOne = 1
+    duration_s: _Duration = 60.0
+    epochs: AtLeastOne = 1
+    expert_flights: Share = 0.0
+    learning_rate: _LearningRate = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SelectConfig:
+class SelectConfig(Bounded):
     """Which weights are best: those that end with the least mean cost over validation worlds.
 
     They are flown over the first `worlds` of that set in each of `set_ups` (`lpac evaluate` has
     them), with messages lost, after every so many epochs and at the end of each round.
     """
 
-    worlds: int = 20
-    set_ups: tuple[str, ...] = ("field",)
-    duration_s: float = 60.0
-    loss: float = 0.0
-    every_epochs: int = 5
+    worlds: AtLeastOne = 20
+    set_ups: Annotated[tuple[str, ...], Meta(min_length=1)] = ("field",)
+    duration_s: _Duration = 60.0
+    loss: Share = 0.0
+    every_epochs: AtLeastOne = 5
 
-    def __post_init__(self) -> None:
-        _at_least(1, worlds=self.worlds, every_epochs=self.every_epochs)
-        _duration(self.duration_s)
-        _share(loss=self.loss)
-        if not self.set_ups:
-            raise ValueError("set_ups = []: must be one or more")
+    def check_rules(self) -> None:
         for name in self.set_ups:
             if name not in SET_UPS:
                 raise ValueError(f"set_ups = {name!r}: allowed are {', '.join(SET_UPS)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExportConfig:
+class ExportConfig(Bounded):
     """What the policy is called, and under what licence it is."""
 
-    name: str
+    name: FileName
     licence: str = "MIT"
-
-    def __post_init__(self) -> None:
-        require_name(self.name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrainingConfig:
+class TrainingConfig(Bounded):
     """All of it; `network` is what the policy family understands."""
 
     perception: PerceptionParameters
@@ -237,10 +215,7 @@ class TrainingConfig:
     export: ExportConfig
     dagger: DaggerConfig = field(default_factory=DaggerConfig)
     select: SelectConfig = field(default_factory=SelectConfig)
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        _at_least(0, seed=self.seed)
+    seed: AtLeastZero = 0
 
     @property
     def parameters(self) -> PolicyParameters:

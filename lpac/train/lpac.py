@@ -8,15 +8,16 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import cast
+from typing import Annotated, cast
 
 import numpy as np
 import torch
+from msgspec import Meta
 from torch import Tensor, nn
 from torch.nn import functional
 
 from edge.core import F32
-from edge.core.schema import from_mapping
+from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, from_mapping
 from edge.policy.bundle import Bundle
 from edge.policy.lpac.images import MAP_CHANNELS, NEIGHBOURS
 from export.checkpoint import (
@@ -38,7 +39,7 @@ _BATCHES = "num_batches_tracked"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LpacNetwork:
+class LpacNetwork(Bounded):
     """Sizes of the network: see `Learnable`.
 
     `channels` are the images that the CNN sees, one of `MAP_CHANNELS`, `image_size` wide;
@@ -50,29 +51,20 @@ class LpacNetwork:
     """
 
     channels: tuple[str, ...] = MAP_CHANNELS[4]
-    image_size: int = 32
-    cnn_channels: tuple[int, ...] = (32, 32, 32)
-    kernel: int = 3
-    features: int = 32
-    layers: int = 2
-    hops: int = 3
-    width: int = 256
-    mlp_width: int = 32
-    mlp_layers: int = 2
+    image_size: AtLeastOne = 32
+    cnn_channels: Annotated[tuple[AtLeastOne, ...], Meta(min_length=1)] = (32, 32, 32)
+    kernel: AtLeastOne = 3
+    features: AtLeastOne = 32
+    layers: AtLeastOne = 2
+    hops: AtLeastZero = 3
+    width: AtLeastOne = 256
+    mlp_width: AtLeastOne = 32
+    mlp_layers: Annotated[int, Meta(ge=2)] = 2
 
-    def __post_init__(self) -> None:
+    def check_rules(self) -> None:
         if self.channels not in MAP_CHANNELS.values():
             allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
             raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
-        if not self.cnn_channels or min(self.cnn_channels) < 1:
-            raise ValueError(f"cnn_channels = {self.cnn_channels}: must be one or more, above 0")
-        for name in ("image_size", "kernel", "features", "layers", "width", "mlp_width"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be at least 1")
-        if self.hops < 0:
-            raise ValueError(f"hops = {self.hops}: must be at least 0")
-        if self.mlp_layers < 2:
-            raise ValueError(f"mlp_layers = {self.mlp_layers}: must be at least 2")
         if self._side < 1:
             raise ValueError(
                 f"image_size = {self.image_size}: must be above {self.image_size - self._side}, "

@@ -53,12 +53,9 @@ ALLOWED = {
     "lpac.sim.ports": set(),
     "lpac.sim.programs": set(),
     "lpac.radio": {"edge.core", "edge.messages", "edge.identity"},
-    "lpac.radio.figures": {
-        "edge.core", "edge.messages", "edge.identity", "lpac.analysis", "lpac.radio",
-    },
     "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
     "lpac.extras": set(),
-    "lpac.network": {
+    "lpac.middleware": {
         "edge.core", "edge.messages", "edge.drivers", "lpac.analysis", "lpac.extras",
         "lpac.radio", "lpac.sim.ports", "lpac.sim.programs",
     },
@@ -77,7 +74,7 @@ ALLOWED = {
         "lpac.analysis", "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch",
         "lpac.evaluate", "lpac.train", "lpac.ablate", "lpac.paper",
         "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
-        "lpac.radio.heat_map", "lpac.network",
+        "lpac.radio.heat_map", "lpac.middleware",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
@@ -92,13 +89,12 @@ ONLY_IN = {
         "lpac/train/",
         "lpac/ablate/",
         "lpac/paper/",
-        "lpac/radio/figures.py",
         "lpac/radio/heat_map.py",
-        "lpac/network/figures.py",
+        "lpac/middleware/figures.py",
     },
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},
-    "cyclonedds": {"lpac/network/over_cyclone.py"},
+    "cyclonedds": {"lpac/middleware/over_cyclone.py"},
     "mcap": {"edge/drivers/"},
     # Elsewhere it is `edge.core.logger`, which loads it without rich.
     "structlog": {"edge/core/logger.py", "edge/drivers/logs.py"},

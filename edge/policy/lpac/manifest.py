@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from edge.core.aggregation import Geometry
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.schema import AtLeastOne, Bounded, ConfigError, from_mapping
 from edge.policy.bundle import LPAC, BundleError, Manifest
 from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
 
@@ -19,21 +19,19 @@ def gnn_graph(layer: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Images:
+class Images(Bounded):
     """What the CNN takes and gives."""
 
     channels: tuple[str, ...]
-    size: int
-    features: int
+    size: AtLeastOne
+    features: AtLeastOne
     activation: Literal["leaky_relu_0.01"] = "leaky_relu_0.01"
     padding: Literal["none"] = "none"
 
-    def __post_init__(self) -> None:
+    def check_rules(self) -> None:
         if self.channels not in MAP_CHANNELS.values():
             allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
             raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
-        if self.size < 1 or self.features < 1:
-            raise ValueError(f"size = {self.size}, features = {self.features}: must be positive")
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from lpac.analysis.snapshot import FleetSnapshot
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
-    from lpac.fleet.radio import BulkStream, Interface
     from lpac.fleet.settings import FleetConfig, RobotHost
+    from lpac.fleet.wifi import BulkStream, Interface
     from lpac.ground.station.subscriber import GroundSubscriber
     from lpac.radio.checked import Checked, WifiReading
     from lpac.radio.pairs import Pair, Window
@@ -141,7 +141,7 @@ def _listen(
     bulk_from: "RobotHost | None",
 ) -> tuple[dict[str, "Window"], "BulkStream | None"]:
     """Of all robots with a slot: who is not judged takes airtime, too."""
-    from lpac.fleet.radio import bulk_stream
+    from lpac.fleet.wifi import bulk_stream
     from lpac.radio.pairs import Window
 
     names = [slot.robot for slot in config.slots if slot.robot is not None]
@@ -171,7 +171,7 @@ def _listen(
 def _read_wifi(
     config: "FleetConfig", robots: Sequence["RobotHost"]
 ) -> "list[Outcome[list[Interface]]]":
-    from lpac.fleet.radio import read_wifi
+    from lpac.fleet.wifi import read_wifi
 
     async def one(robot: "RobotHost", report: "Report") -> "list[Interface]":
         return await read_wifi(config, robot, report)
@@ -193,7 +193,7 @@ def _checked(
     loaded: bool,
 ) -> "Checked":
     from edge.identity.envelope import OVERHEAD_BYTES
-    from lpac.fleet.radio import in_the_wifi, reading
+    from lpac.fleet.wifi import in_the_wifi, reading
     from lpac.radio.checked import Checked
 
     then = {outcome.robot.name: outcome.value or [] for outcome in before}

@@ -11,14 +11,15 @@ robot's `Explored`, the last `GroundEvent`s, and then a `FleetSnapshot` at 5 Hz 
 rest as it happens, until the client leaves.
 """
 
-import re
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
+from msgspec import Meta
 
 from edge.core.fence import Fence
+from edge.core.schema import Bounded
 from edge.core.world import MOST_FEATURES, parse_world
 from edge.messages.codec import MessageError, decode, encode
 from edge.messages.codes import RefusalCode
@@ -29,7 +30,6 @@ from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEv
 # With a reserve: 5 Hz is promised.
 SNAPSHOT_PERIOD_S = 0.18
 SUBSCRIBE = b"subscribe\n"
-_TRIAL = re.compile(r"[A-Za-z0-9_.-]{0,32}")
 
 T = TypeVar("T")
 
@@ -96,19 +96,15 @@ class Enable:
 
 
 @dataclass(frozen=True, slots=True)
-class Takeoff:
+class Takeoff(Bounded):
     """One after another, `interval_s` apart, the highest first; done when all are at their heights.
 
     With `abort_on_failure` nobody else takes off once one has failed.
     """
 
     robots: tuple[str, ...] = ()
-    interval_s: float = 2.0
+    interval_s: Annotated[float, Meta(ge=0.0, le=600.0)] = 2.0
     abort_on_failure: bool = False
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.interval_s <= 600.0:
-            raise ValueError(f"interval_s = {self.interval_s}: must be from 0 to 600")
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,20 +145,20 @@ class RobotCommand:
 
 
 @dataclass(frozen=True, slots=True)
-class NextTrial:
+class NextTrial(Bounded):
     """The next trial, called `trial`, or numbered on: explored maps and mailboxes are reset.
 
     Refused while a robot flies its mission.
     """
 
-    trial: str = ""
+    trial: Annotated[
+        str,
+        Meta(
+            pattern=r"\A[A-Za-z0-9_.-]{0,32}\Z",
+            description="at most 32 letters, digits, '.', '-' and '_'",
+        ),
+    ] = ""
     robots: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if _TRIAL.fullmatch(self.trial) is None:
-            raise ValueError(
-                f"trial = {self.trial!r}: must be at most 32 letters, digits, '.', '-' and '_'"
-            )
 
 
 @dataclass(frozen=True, slots=True)

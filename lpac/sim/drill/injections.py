@@ -6,7 +6,7 @@ Those below `VehicleInjection` are done to a simulated vehicle, whoever flies it
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
@@ -408,7 +408,7 @@ class SecondProgram:
 
 @dataclass(frozen=True, slots=True)
 class RadioIs:
-    """What becomes of all messages; see `lpac.sim.radio.Air`."""
+    """What becomes of all messages; see `lpac.sim.air.Air`."""
 
     loss: float = 0.0
     duplication: float = 0.0
@@ -504,7 +504,3 @@ class Do:
     injection: Injection
     to: Literal["hit", "all", "others", "next"] = "hit"
     mark: str = ""
-
-    def later(self, by_s: float) -> "Do":
-        """The same, that much later."""
-        return replace(self, at_s=self.at_s + by_s)

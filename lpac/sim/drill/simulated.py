@@ -13,6 +13,7 @@ import numpy as np
 from edge.core import F64
 from lpac.ground.procedure import NothingComesError, Procedure
 from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
+from lpac.sim.air import GROUND
 from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.field import (
     DrilledRobots,
@@ -52,7 +53,6 @@ from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
-from lpac.sim.radio import GROUND
 from lpac.sim.scenario import WORLD_SENSOR
 
 # How far a second program's vehicle stands from the first.

@@ -12,13 +12,13 @@ from lpac.analysis.logs import logs_of
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
+from lpac.sim.air import Air
 from lpac.sim.failure import Failure
 from lpac.sim.fleet.flight import FleetFlight, RobotUsage, flight_of
 from lpac.sim.fleet.listener import Say
 from lpac.sim.fleet.pilot import LOOKS_S, Pilot, perturbations
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
-from lpac.sim.radio import Air
 from lpac.sim.scenario import Scenario
 
 # No flight lasts so long, and as many of them end before the year 2038.

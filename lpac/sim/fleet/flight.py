@@ -18,7 +18,7 @@ from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, StateChange, changes_of
 from lpac.analysis.logs import LoggedStatus, Logs, read_files, simulated_name
-from lpac.analysis.trials import find_missions, record_of, whole_record
+from lpac.analysis.missions import find_missions, record_of, whole_record
 from lpac.analysis.truth import TRUTH, TrueTrack, write_truth
 from lpac.ground.station.client import GroundError
 from lpac.ground.station.commands import in_words

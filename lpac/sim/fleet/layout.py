@@ -15,7 +15,7 @@ from edge.messages.mission import Origin
 from edge.policy.bundle import load_bundle, make_bundle, write_bundle
 from lpac.fleet.settings import Places
 from lpac.fleet.writer import assign, write_fleet, write_robot
-from lpac.sim.description import ERRORS, FIELD_SCALE, fence_around, robot_table
+from lpac.sim.description import FIELD_SCALE, fence_around, robot_table
 from lpac.sim.px4.errors import Errors
 from lpac.sim.px4.vehicle import GPS_ACCURACY_M, Px4Vehicle
 from lpac.sim.px4.world import WorldOrigin
@@ -30,8 +30,6 @@ Settings = Mapping[str, Mapping[str, object]]
 WORLD = WorldOrigin()
 ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
 
-# Pads, which are landing points too, of robots without a budget of their own.
-APART_M = places_apart(ERRORS.position_m, ERRORS.position_m).least_m
 # As far inside the field as there is room: what a robot takes its place to be walks.
 _PADS_INSIDE_FIELD_M = (2.0, 1.0, 0.0)
 # How often pads are drawn anew, and pushed apart, before there is no room for them.

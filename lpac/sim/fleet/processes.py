@@ -14,7 +14,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from edge.core import F64
 from edge.core.counted import counted
 from edge.robot.config import Rates
 from lpac.sim.fleet.keys import write_keys
@@ -360,13 +359,6 @@ class Fleet:
         """Keep nothing of the past, which only grows, and which a flight's figures alone need."""
         self.heard.forget()
         self.vehicles.forget()
-
-    def true_positions_m(self) -> F64:
-        """Where simulated vehicles really are: the mission frame, (N, 3)."""
-        assert self.simulated is not None
-        with self.simulated.stepped:
-            world_m = [vehicle.position_m for vehicle in self.simulated.vehicles]
-        return np.array([self.layout.to_mission.local_to_mission(place_m) for place_m in world_m])
 
     def _stop_robots(self) -> None:
         running = [robot for robot in self.robots if robot.running]

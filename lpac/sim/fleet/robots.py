@@ -1,7 +1,7 @@
 """Whole robots on one clock, in one process: their real nodes, and simulated vehicles.
 
-Who has them gives them their links, and lets their time pass: on a simulated clock
-(`fleet.simulated`), or as fast as real time (`fleet.live`).
+Who has them gives them their links, and lets their time pass: `fleet.simulated` on a simulated
+clock.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,10 +24,10 @@ from edge.policy.family import VerifiedPolicy, verified
 from edge.robot.config import RobotConfig, load_config
 from edge.robot.log import open_log
 from edge.robot.node import Ports, RobotNode
+from lpac.sim.air import Subscriptions
 from lpac.sim.fleet.layout import Layout, Settings
 from lpac.sim.fleet.recorded import RecordedPolicy, recorded_steps
 from lpac.sim.px4.direct import DirectVehicle
-from lpac.sim.radio import Subscriptions
 from lpac.sim.scenario import Scenario
 from lpac.sim.schedule import Recurrence, Schedule, WallClock
 

@@ -29,10 +29,10 @@ from lpac.ground.station.protocol import (
     Request,
     ServerMessage,
 )
+from lpac.sim.air import GROUND, Radio, RadioLink, Subscriptions
 from lpac.sim.fleet.layout import Settings
 from lpac.sim.fleet.members import SimulatedMembers
 from lpac.sim.fleet.robots import VEHICLE_STEP_S, SimulatedRobot, SimulatedRobots
-from lpac.sim.radio import GROUND, Radio, RadioLink, Subscriptions
 from lpac.sim.scenario import Scenario
 from lpac.sim.schedule import Schedule, WallClock
 

@@ -1,9 +1,7 @@
-"""One robot's computer on this machine, with a simulated PX4, and what may befall it."""
+"""One robot's computer on this machine, with a simulated PX4."""
 
 import contextlib
 import math
-import os
-import signal
 import socket
 import subprocess
 import threading
@@ -14,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lpac.sim.fleet.layout import ORIGIN, WORLD
-from lpac.sim.hosts.rack import Rack, children
+from lpac.sim.hosts.rack import Rack
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.server import Instance, Px4Server
 from lpac.sim.px4.vehicle import Px4Vehicle
@@ -22,7 +20,6 @@ from lpac.sim.px4.vehicle import Px4Vehicle
 # Three releases of an image fit.
 DISK_MB = 640
 BOOT_WITHIN_S = 60.0
-RUN_WITHIN_S = 60.0
 MAVLINK_PORT = 14551
 
 _PADS_APART_M = 8.0
@@ -30,14 +27,14 @@ _PADS_IN_ROW = 5
 _PX4_PORT = 14550
 _BOARD_UID = 0x4D30303534  # the same on all boards
 
-# In the rack: name, address with prefix, MAC address, state of the link.
+# In the rack: name, address with prefix, MAC address.
 _WIRE = """
 ip netns add "$1"
 ip -n "$1" link set lo up
 ip -n "$1" link add wlan0 address "$3" type veth peer name "$1" netns air
 ip -n "$1" address add "$2" dev wlan0
 ip -n "$1" link set wlan0 up
-ip -n air link set "$1" master bridge "$4"
+ip -n air link set "$1" master bridge up
 """
 _FORMAT = """
 cd /run
@@ -52,10 +49,10 @@ mount -t overlay -o "lowerdir=/run/base,upperdir=upper,workdir=work" "$1" root
 
 
 class SimulatedHost:
-    """One robot's computer and vehicle; `RobotHosts` makes it.
+    """One robot's computer and vehicle; `SimulatedHosts` makes it.
 
     `vehicle` is its PX4: whoever commands it or sets more than one of its fields holds `stepped`.
-    It is another object after every `power_on`, with the parameters of the one before.
+    It is another object each time that the host is switched on.
     """
 
     def __init__(self, rack: Rack, folder: Path, robot_id: int, key: str) -> None:
@@ -78,7 +75,6 @@ class SimulatedHost:
             "root/.ssh/authorized_keys": (0o600, key + "\n"),
         }
         private.unlink()
-        self._connected = True
         self._process: subprocess.Popen[bytes] | None = None
         self._booting: socket.socket | None = None
         self._server: Px4Server | None = None
@@ -97,86 +93,6 @@ class SimulatedHost:
             raise RuntimeError(f"{self.name} is off")
         return self._server.stepped
 
-    def run(self, command: str, *, timeout_s: float = RUN_WITHIN_S) -> str:
-        """What a shell command prints on the host, as root, through its systemd, not its network.
-
-        Raises RuntimeError with what it printed unless it returns 0; TimeoutExpired.
-        """
-        # Its own systemd runs it: what merely enters its namespaces keeps this machine's
-        # privileges, and could set this machine's clock.
-        done = subprocess.run(
-            [
-                "nsenter", f"--target={self._leader()}", "--all", "env", "-i",
-                "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
-                "systemd-run", "--quiet", "--wait", "--pipe", "--property=KillMode=process",
-                "--property=WorkingDirectory=/root", "--setenv=HOME=/root",
-                # systemd-run would put its own variables in.
-                "/bin/sh", "-c", command.replace("$", "$$"),
-            ],
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s,
-            check=False,
-        )  # fmt: skip
-        if done.returncode:
-            said = (done.stdout + done.stderr).strip()
-            raise RuntimeError(f"{self.name}: {command!r} returned {done.returncode}: {said}")
-        return done.stdout
-
-    # Mishaps
-
-    def cut(self) -> None:
-        """Nothing passes between the host and the network any more, also after `power_on`."""
-        self._connect(False)
-
-    def heal(self) -> None:
-        """The network is there again."""
-        self._connect(True)
-
-    def fill_disk(self) -> None:
-        """No block is free any more."""
-        disk = self._disk()
-        with (disk / "filler").open("wb") as file:
-            size = 0
-            while free := (found := os.statvfs(disk)).f_bavail * found.f_frsize:
-                # Whoever writes just now may have taken some of it.
-                with contextlib.suppress(OSError):
-                    os.posix_fallocate(file.fileno(), size, free)
-                    size += free
-
-    def free_disk(self) -> None:
-        """Undo `fill_disk`."""
-        (self._disk() / "filler").unlink(missing_ok=True)
-
-    def power_off(self) -> None:
-        """All that runs on it, and its PX4, is gone at once; others hear nothing of that.
-
-        Raises RuntimeError if it is off.
-        """
-        if self._process is None:
-            raise RuntimeError(f"{self.name} is off")
-        self._set_port("down")
-        self._parameters = dict(self.vehicle.parameters)
-        self.stop_vehicle()
-        with contextlib.suppress(RuntimeError):
-            os.kill(self._leader(), signal.SIGKILL)
-        self.ended()
-        self._rack.sh('ip -n air link delete "$1"; ip netns delete "$1"', self.name)
-
-    def power_on(self) -> None:
-        """Boot from the same disk; returns once the system is up. Raises OSError if it is not."""
-        self.switch_on()
-        self.await_boot()
-
-    def reset(self) -> None:
-        """A new disk, a new PX4 and a network that works, as at the start. It reboots for that."""
-        if self._process is not None:
-            self.power_off()
-        self._connected = True
-        self._parameters = {"MAV_SYS_ID": self.robot_id}
-        self.format()
-        self.power_on()
-
-    # For RobotHosts: the steps of that
-
     def format(self) -> None:
         """Give it a new disk, while it is off."""
         self._rack.sh(_FORMAT, self.name, str(DISK_MB))
@@ -189,12 +105,9 @@ class SimulatedHost:
 
     def switch_on(self) -> None:
         """Begin to boot, with the vehicle running."""
-        if self._process is not None:
-            raise RuntimeError(f"{self.name} is on")
         self._rack.sh(
             _WIRE, self.name, f"{self.address}/{self._rack.network.prefixlen}",
             f"02:00:00:00:{self._rack.number:02x}:{self.robot_id:02x}",
-            "up" if self._connected else "down",
         )  # fmt: skip
         self.vehicle = self._new_vehicle()
         link = Px4Link(
@@ -255,25 +168,6 @@ class SimulatedHost:
         vehicle.gps_bias_m = np.zeros(3)
         vehicle.parameters.update(self._parameters)
         return vehicle
-
-    def _disk(self) -> Path:
-        return self._rack.path(f"run/{self.name}")
-
-    def _connect(self, connected: bool) -> None:
-        self._connected = connected
-        if self._process is not None:
-            self._set_port("up" if connected else "down")
-
-    def _set_port(self, state: str) -> None:
-        self._rack.sh('ip -n air link set "$1" "$2"', self.name, state)
-
-    def _leader(self) -> int:
-        """The host's process 1. Raises RuntimeError while the host is off."""
-        containers = children(self._process.pid) if self._process else []
-        leaders = [leader for container in containers for leader in children(container)]
-        if len(leaders) != 1:
-            raise RuntimeError(f"{self.name} is off")
-        return leaders[0]
 
 
 def new_key(private: Path) -> str:

@@ -7,11 +7,11 @@ clock is this machine's (it cannot be set), its kernel too, and memory limits ar
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Self, overload
+from typing import Self
 
 import numpy as np
 
@@ -22,8 +22,6 @@ from lpac.sim.hosts.base import base_tree, require_tools
 from lpac.sim.hosts.host import MAVLINK_PORT, SimulatedHost, new_key
 from lpac.sim.hosts.rack import Rack
 
-__all__ = ["SimulatedHost", "SimulatedHosts"]
-
 MAX_HOSTS = 20
 FIELD_M = 32.0
 _MAX_SPEED_M_S = 1.25
@@ -31,12 +29,14 @@ _MAX_SPEED_M_S = 1.25
 Say = Callable[[str], None]
 
 
-class SimulatedHosts(Sequence[SimulatedHost]):
+class SimulatedHosts:
     """A context in which hosts r1, r2, ... run, the last `spares` of them without a slot.
 
     `folder` then holds `fleet_toml`, a complete description of them for `lpac fleet`, with
     ssh_config, keys and world.env beside it. `fleet` is a name that no other hosts have now.
     """
+
+    host_type = SimulatedHost
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class SimulatedHosts(Sequence[SimulatedHost]):
             self.fleet = f"hosts-{rack.number}-{os.getpid()}"
             key = new_key(self.folder / "id_ed25519")
             self._hosts = [
-                SimulatedHost(rack, self.folder, robot_id, key)
+                self.host_type(rack, self.folder, robot_id, key)
                 for robot_id in range(1, self._count + 1)
             ]
             for host in self._hosts:
@@ -103,15 +103,11 @@ class SimulatedHosts(Sequence[SimulatedHost]):
     ) -> None:
         self._stack.__exit__(kind, error, traceback)
 
-    @overload
-    def __getitem__(self, index: int) -> SimulatedHost: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[SimulatedHost]: ...
-    def __getitem__(self, index: int | slice) -> SimulatedHost | list[SimulatedHost]:
-        return self._hosts[index]
+    def __iter__(self) -> Iterator[SimulatedHost]:
+        return iter(self._hosts)
 
-    def __len__(self) -> int:
-        return self._count
+    def __getitem__(self, index: int) -> SimulatedHost:
+        return self._hosts[index]
 
     def _ended(self) -> None:
         for host in self._hosts:

@@ -19,9 +19,8 @@ from lpac.fleet.release import Image, load_image
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
 from lpac.sim.fleet.keys import OPERATOR
 from lpac.sim.hosts.base import NoHostsError
-from lpac.sim.hosts.host import SimulatedHost
-from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT, SHIPPED
+from tests.host.hosts import FrailHost, FrailHosts
 
 SILENT = "it does not answer: it is off, or out of reach"
 
@@ -62,12 +61,12 @@ def running_lpac_fleet(
 
 
 @contextmanager
-def booted(image: Path, folder: Path, count: int) -> Iterator[SimulatedHosts]:
+def booted(image: Path, folder: Path, count: int) -> Iterator[FrailHosts]:
     """Robot computers, the last one without a slot. Skips where this machine can have none."""
     with ExitStack() as stack:
         try:
             hosts = stack.enter_context(
-                SimulatedHosts(count, folder, image=image, bundle=SHIPPED, spares=1)
+                FrailHosts(count, folder, image=image, bundle=SHIPPED, spares=1)
             )
         except NoHostsError as reason:
             pytest.skip(str(reason))
@@ -78,7 +77,7 @@ def unwatched(_: str, __: float | None) -> None:
     """A report that nobody reads."""
 
 
-def name_robot(hosts: SimulatedHosts, host: SimulatedHost) -> None:
+def name_robot(hosts: FrailHosts, host: FrailHost) -> None:
     """Give the host its identity and its card, as `enroll` does."""
     identity = {"fleet": hosts.fleet, "robot": host.name, "robot_id": host.robot_id}
     host.run(f"mkdir -p /etc/lpac; echo '{json.dumps(identity)}' > /etc/lpac/robot.json")
@@ -86,7 +85,7 @@ def name_robot(hosts: SimulatedHosts, host: SimulatedHost) -> None:
     asyncio.run(_give_card(config, config.robots[host.name]))
 
 
-def give_image(host: SimulatedHost, image: Image, image_id: str | None = None) -> None:
+def give_image(host: FrailHost, image: Image, image_id: str | None = None) -> None:
     """Let it have the files of the image, of 170 MB, from an earlier release: none travels.
 
     With an `image_id` of another image: only the files are the same.
@@ -98,7 +97,7 @@ def give_image(host: SimulatedHost, image: Image, image_id: str | None = None) -
 
 
 def deploy_to(
-    hosts: SimulatedHosts, *names: str, image_id: str | None = None
+    hosts: FrailHosts, *names: str, image_id: str | None = None
 ) -> dict[str, dict[str, Any]]:
     """Give the robots their identity, if they are new, and the release; what `deploy` says of each.
 
@@ -122,7 +121,7 @@ async def _give_card(config: FleetConfig, robot: RobotHost) -> None:
 
 
 @contextmanager
-def armed(host: SimulatedHost) -> Iterator[None]:
+def armed(host: FrailHost) -> Iterator[None]:
     """Its vehicle is armed meanwhile, and does not disarm by itself."""
     with host.stepped:
         host.vehicle.parameters["COM_DISARM_PRFLT"] = 0.0
@@ -134,7 +133,7 @@ def armed(host: SimulatedHost) -> Iterator[None]:
             host.vehicle.disarm(force=True)
 
 
-def await_said(host: SimulatedHost, text: str) -> None:
+def await_said(host: FrailHost, text: str) -> None:
     """Until the robot's program says so of itself."""
     host.run(
         f"until systemctl show -p StatusText lpac-robot | grep -q '{text}'; do sleep 0.1; done"

@@ -10,14 +10,14 @@ from lpac.fleet.hold import Report, hold
 from lpac.fleet.release import Common, Release, load_common, make_release
 from lpac.fleet.session import connect
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
-from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.host.fleet.field import unwatched
+from tests.host.hosts import FrailHosts
 
 
 class Laptop:
     """What an operator has: fleet.toml as it is now, and the releases made from it."""
 
-    def __init__(self, hosts: SimulatedHosts, folder: Path) -> None:
+    def __init__(self, hosts: FrailHosts, folder: Path) -> None:
         self.hosts = hosts
         self.config: FleetConfig = load_fleet(hosts.fleet_toml)
         self.common: Common = load_common(self.config)

@@ -14,7 +14,6 @@ import pytest
 
 from lpac.fleet.cards import open_authority
 from lpac.fleet.settings import load_fleet
-from lpac.sim.hosts.hosts import SimulatedHosts
 from lpac.sim.hosts.rack import children
 from lpac.sim.px4.modes import Px4Mode
 from tests.host.fleet.field import (
@@ -26,12 +25,13 @@ from tests.host.fleet.field import (
     lpac_fleet,
     running_lpac_fleet,
 )
+from tests.host.hosts import FrailHosts
 
 
 class Operator:
     """Types commands for one fleet."""
 
-    def __init__(self, hosts: SimulatedHosts) -> None:
+    def __init__(self, hosts: FrailHosts) -> None:
         self.hosts = hosts
         self.fleet_toml = hosts.fleet_toml
 

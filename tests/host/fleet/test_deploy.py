@@ -19,8 +19,6 @@ from lpac.fleet.deploy import deploy
 from lpac.fleet.hold import hold
 from lpac.fleet.release import Release, make_release
 from lpac.fleet.session import FleetError, RemoteError, UnreachableError, connect
-from lpac.sim.hosts.host import SimulatedHost
-from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.host.fleet.field import (
     armed,
     await_said,
@@ -30,10 +28,11 @@ from tests.host.fleet.field import (
     unwatched,
 )
 from tests.host.fleet.laptop import Laptop, boot_nonce
+from tests.host.hosts import FrailHost, FrailHosts
 
 
 @pytest.fixture(scope="module")
-def laptop(hosts: SimulatedHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
+def laptop(hosts: FrailHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
     """r1 and r2 run a first release; r3 is there, whatever it has."""
     laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
     deploy_to(hosts, "r1", "r2")
@@ -47,7 +46,7 @@ def await_true(holds: Callable[[], bool], within_s: float = 120.0) -> None:
         time.sleep(0.05)
 
 
-def await_free(host: SimulatedHost) -> None:
+def await_free(host: FrailHost) -> None:
     """Until nobody holds the robot. To ask mends nothing, as the robot's own `lock` does."""
     host.run("flock --shared /run/lpac-fleet.lock true")
 

@@ -24,13 +24,12 @@ from lpac.fleet.doctor import (
 from lpac.fleet.operations import Outcome, for_each
 from lpac.fleet.settings import RobotHost, load_fleet
 from lpac.fleet.up import bring_up
-from lpac.sim.hosts.host import SimulatedHost
-from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.host.fleet.field import SILENT, armed, deploy_to, lpac_fleet, name_robot, unwatched
+from tests.host.hosts import FrailHost, FrailHosts
 
 
 @pytest.fixture(scope="module")
-def enrolled(hosts: SimulatedHosts) -> SimulatedHosts:
+def enrolled(hosts: FrailHosts) -> FrailHosts:
     """With their identity; r1, r2 and r3 with new disks, and nothing else is done to them."""
     for host in hosts[:3]:
         host.reset()
@@ -40,7 +39,7 @@ def enrolled(hosts: SimulatedHosts) -> SimulatedHosts:
 
 
 @contextlib.contextmanager
-def deaf(one: SimulatedHost, other: SimulatedHost) -> Iterator[None]:
+def deaf(one: FrailHost, other: FrailHost) -> Iterator[None]:
     """Nothing passes from one to the other, though both have the network."""
     script = 'ip -n "$1" route "$2" blackhole "$3"/32'
     one._rack.sh(script, one.name, "add", other.address)
@@ -51,7 +50,7 @@ def deaf(one: SimulatedHost, other: SimulatedHost) -> Iterator[None]:
 
 
 def run_doctor(
-    hosts: SimulatedHosts, robots: str = "r1,r2,r3", **clock: Any
+    hosts: FrailHosts, robots: str = "r1,r2,r3", **clock: Any
 ) -> dict[str, dict[str, DoctorCheck]]:
     config = load_fleet(hosts.fleet_toml)
     chosen = [config.robots[name] for name in robots.split(",")]
@@ -67,7 +66,7 @@ def run_doctor(
     }
 
 
-def test_a_stock_robot_is_told_what_it_lacks(enrolled: SimulatedHosts) -> None:
+def test_a_stock_robot_is_told_what_it_lacks(enrolled: FrailHosts) -> None:
     for checks in run_doctor(enrolled).values():
         verdicts = {check.name: check.verdict for check in checks.values()}
         assert {name for name, verdict in verdicts.items() if verdict == "FAILED"} == {
@@ -81,7 +80,7 @@ def test_a_stock_robot_is_told_what_it_lacks(enrolled: SimulatedHosts) -> None:
             assert verdicts[name] == "ok", checks[name]
 
 
-def test_each_robot_has_its_own_faults_alone(enrolled: SimulatedHosts) -> None:
+def test_each_robot_has_its_own_faults_alone(enrolled: FrailHosts) -> None:
     """A full disk, no radio link between two, and one that is off."""
     r1, r2, r3, r4 = enrolled
     r1.fill_disk()
@@ -101,7 +100,7 @@ def test_each_robot_has_its_own_faults_alone(enrolled: SimulatedHosts) -> None:
     assert (reach.name, reach.verdict, reach.found) == ("reach", "FAILED", SILENT)
 
 
-def test_another_clock_another_vehicle_and_one_that_is_silent(enrolled: SimulatedHosts) -> None:
+def test_another_clock_another_vehicle_and_one_that_is_silent(enrolled: FrailHosts) -> None:
     text = enrolled.fleet_toml.read_text()
     changed = text.replace("robot_id = 1\n", "robot_id = 1\nsystem_id = 99\n")
     changed = changed.replace(
@@ -119,7 +118,7 @@ def test_another_clock_another_vehicle_and_one_that_is_silent(enrolled: Simulate
     assert "14551, configured is 14999" in found["r2"]["vision-hub"].found
 
 
-def test_doctor_prints_a_board_and_fails(enrolled: SimulatedHosts) -> None:
+def test_doctor_prints_a_board_and_fails(enrolled: FrailHosts) -> None:
     asked = (enrolled.fleet_toml, "doctor", "--robots", "r1,r3")
     shown = lpac_fleet(*asked)
     assert shown.returncode == 1
@@ -134,7 +133,7 @@ def test_doctor_prints_a_board_and_fails(enrolled: SimulatedHosts) -> None:
     assert hub["fix"].startswith("lpac fleet enroll r1")
 
 
-def test_ping_has_every_way(enrolled: SimulatedHosts) -> None:
+def test_ping_has_every_way(enrolled: FrailHosts) -> None:
     shown = lpac_fleet(enrolled.fleet_toml, "ping", "--json")
     assert shown.returncode == 0, shown.stderr
     robots = json.loads(shown.stdout)["robots"]
@@ -149,7 +148,7 @@ def test_ping_has_every_way(enrolled: SimulatedHosts) -> None:
     assert "lost" in shown.stdout
 
 
-def test_up_says_no_go_with_the_reasons(enrolled: SimulatedHosts) -> None:
+def test_up_says_no_go_with_the_reasons(enrolled: FrailHosts) -> None:
     enrolled[2].cut()
     try:
         shown = lpac_fleet(enrolled.fleet_toml, "up", "--timeout", "3", "--json")
@@ -164,7 +163,7 @@ def test_up_says_no_go_with_the_reasons(enrolled: SimulatedHosts) -> None:
     assert robots["r3"]["reasons"] == [f"up: {SILENT}"]
 
 
-def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: SimulatedHosts) -> None:
+def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: FrailHosts) -> None:
     config = load_fleet(enrolled.fleet_toml)
     config = replace(config, ssh=replace(config.ssh, connect_timeout_s=1.0))
     robot = config.robots["r1"]
@@ -181,7 +180,7 @@ def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: SimulatedHosts)
     assert arrival == ((), ())
 
 
-def test_a_clock_that_cannot_be_set_is_no_go(enrolled: SimulatedHosts) -> None:
+def test_a_clock_that_cannot_be_set_is_no_go(enrolled: FrailHosts) -> None:
     """A container may not set the clock of the machine that it runs on."""
     config = load_fleet(enrolled.fleet_toml)
     arrival = asyncio.run(
@@ -194,7 +193,7 @@ def test_a_clock_that_cannot_be_set_is_no_go(enrolled: SimulatedHosts) -> None:
 
 
 def test_up_starts_what_was_switched_off_and_says_go(
-    enrolled: SimulatedHosts,
+    enrolled: FrailHosts,
 ) -> None:
     host = enrolled[0]
     config = load_fleet(enrolled.fleet_toml)
@@ -236,7 +235,7 @@ def test_up_starts_what_was_switched_off_and_says_go(
     assert host.run("systemctl is-active lpac-robot || true") == "inactive\n"
 
 
-def test_up_gives_robots_the_key_of_their_group(enrolled: SimulatedHosts, tmp_path: Path) -> None:
+def test_up_gives_robots_the_key_of_their_group(enrolled: FrailHosts, tmp_path: Path) -> None:
     host = enrolled[1]
     text = enrolled.fleet_toml.read_text()
     radio = f'[radio]\ntransport = "multicast"\nrouter = "{host.address}:7447"\n\n[robot]'
@@ -266,7 +265,7 @@ def test_up_gives_robots_the_key_of_their_group(enrolled: SimulatedHosts, tmp_pa
         enrolled.fleet_toml.write_text(text)
 
 
-def test_the_password_that_every_voxl_comes_with_is_found(enrolled: SimulatedHosts) -> None:
+def test_the_password_that_every_voxl_comes_with_is_found(enrolled: FrailHosts) -> None:
     host = enrolled[1]
     host.run("echo root:oelinux123 | chpasswd")
     try:
@@ -276,7 +275,7 @@ def test_the_password_that_every_voxl_comes_with_is_found(enrolled: SimulatedHos
     assert doors.verdict == "FAILED" and doors.fix.endswith("'passwd root'")
 
 
-def test_no_clock_is_set_under_an_armed_vehicle(enrolled: SimulatedHosts) -> None:
+def test_no_clock_is_set_under_an_armed_vehicle(enrolled: FrailHosts) -> None:
     config = load_fleet(enrolled.fleet_toml)
     with armed(enrolled[1]):
         arrival = asyncio.run(

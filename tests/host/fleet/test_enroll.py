@@ -10,10 +10,9 @@ import pytest
 from lpac.fleet.enroll import _robot
 from lpac.fleet.release import load_image
 from lpac.fleet.settings import load_fleet
-from lpac.sim.hosts.host import SimulatedHost
-from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT
 from tests.host.fleet.field import armed, give_image, lpac_fleet
+from tests.host.hosts import FrailHost, FrailHosts
 from tests.needs import needs
 
 EXAMPLE = ROOT / "docs" / "fleet.toml"
@@ -52,7 +51,7 @@ UNIT = "[Service]\nExecStart=/bin/sleep infinity\n[Install]\nWantedBy=multi-user
 
 
 @pytest.fixture
-def new(hosts: SimulatedHosts) -> SimulatedHost:
+def new(hosts: FrailHosts) -> FrailHost:
     """r4 as it came: only a password lets in, and the fleet of `fleet_file` does not know it."""
     host = hosts[3]
     host.reset()
@@ -60,7 +59,7 @@ def new(hosts: SimulatedHosts) -> SimulatedHost:
 
 
 @pytest.fixture
-def fleet_file(hosts: SimulatedHosts, tmp_path: Path) -> Path:
+def fleet_file(hosts: FrailHosts, tmp_path: Path) -> Path:
     """The fleet without r4, with predecessors; ssh asks about unknown hosts, as is its default."""
     text = hosts.fleet_toml.read_text()
     before, _, after = text.partition("\n[robots.r4]\n")
@@ -92,7 +91,7 @@ def person(tmp_path: Path) -> dict[str, str]:
     return {"SSH_ASKPASS": str(script), "SSH_ASKPASS_REQUIRE": "force"}
 
 
-def install(host: SimulatedHost, path: str, text: str, mode: int = 0o644) -> None:
+def install(host: FrailHost, path: str, text: str, mode: int = 0o644) -> None:
     file = host.root / path
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(text)
@@ -109,7 +108,7 @@ def outcomes(text: str) -> dict[str, str]:
     }
 
 
-def as_a_lab_left_it(new: SimulatedHost, image: Path) -> None:
+def as_a_lab_left_it(new: FrailHost, image: Path) -> None:
     """A password, and three programs that may command the vehicle."""
     give_image(new, load_image(image))
     (new.root / "root/.ssh/authorized_keys").write_text("ssh-ed25519 AAAA another's")
@@ -123,7 +122,7 @@ def as_a_lab_left_it(new: SimulatedHost, image: Path) -> None:
     )
 
 
-def assert_alone(new: SimulatedHost, said: str) -> None:
+def assert_alone(new: FrailHost, said: str) -> None:
     """The predecessors do not run any more; what else runs was told."""
     containers = json.loads((new.root / "var/lib/docker.json").read_text())
     old, camera = containers["old_stack"], containers["camera"]
@@ -137,8 +136,8 @@ def assert_alone(new: SimulatedHost, said: str) -> None:
 
 
 def test_from_a_password_to_a_robot_of_the_fleet(
-    hosts: SimulatedHosts,
-    new: SimulatedHost,
+    hosts: FrailHosts,
+    new: FrailHost,
     fleet_file: Path,
     tmp_path: Path,
     person: dict[str, str],
@@ -208,8 +207,8 @@ def test_from_a_password_to_a_robot_of_the_fleet(
 
 
 def test_a_robot_is_not_renamed_nor_touched_in_flight_nor_let_in_unseen(
-    hosts: SimulatedHosts,
-    new: SimulatedHost,
+    hosts: FrailHosts,
+    new: FrailHost,
     fleet_file: Path,
     tmp_path: Path,
     person: dict[str, str],

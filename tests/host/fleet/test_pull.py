@@ -16,9 +16,8 @@ from edge.drivers.flight_log import FlightLog, FlightMetadata, read
 from lpac.fleet.pull import Pulled, pull
 from lpac.fleet.session import FleetError
 from lpac.fleet.settings import load_fleet
-from lpac.sim.hosts.host import SimulatedHost
-from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.host.fleet.field import armed, deploy_to, lpac_fleet, unwatched
+from tests.host.hosts import FrailHost, FrailHosts
 
 LOGS = "var/lib/private/lpac/logs"
 # In the past, so that no file is taken for one that still grows.
@@ -38,7 +37,7 @@ def write_logs(folder: Path, robot_id: int, trials: list[tuple[str, float]]) -> 
         os.utime(newest, (began_s + 11.0, began_s + 11.0))
 
 
-def write_ulog(host: SimulatedHost, session: str, ended_s: float, data: bytes) -> None:
+def write_ulog(host: FrailHost, session: str, ended_s: float, data: bytes) -> None:
     path = host.root / f"data/px4/log/{session}/log100.ulg"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
@@ -46,7 +45,7 @@ def write_ulog(host: SimulatedHost, session: str, ended_s: float, data: bytes) -
 
 
 @pytest.fixture(scope="module")
-def flown(hosts: SimulatedHosts) -> SimulatedHosts:
+def flown(hosts: FrailHosts) -> FrailHosts:
     """r1 has flown the trials A and B; r4, a spare, nothing."""
     deploy_to(hosts, "r1", "r4")
     r1 = hosts[0]
@@ -59,13 +58,13 @@ def flown(hosts: SimulatedHosts) -> SimulatedHosts:
     return hosts
 
 
-def pulled(hosts: SimulatedHosts, trial: str | None, out: Path) -> Coroutine[None, None, Pulled]:
+def pulled(hosts: FrailHosts, trial: str | None, out: Path) -> Coroutine[None, None, Pulled]:
     """What is to be awaited: r1's part."""
     config = load_fleet(hosts.fleet_toml)
     return pull(config, config.robots["r1"], trial, out, unwatched)
 
 
-def fetch(hosts: SimulatedHosts, trial: str | None, out: Path) -> Pulled:
+def fetch(hosts: FrailHosts, trial: str | None, out: Path) -> Pulled:
     return asyncio.run(pulled(hosts, trial, out))
 
 
@@ -74,7 +73,7 @@ def names(folder: Path) -> set[str]:
 
 
 def test_what_belongs_to_the_trial_comes_whole_and_only_once(
-    flown: SimulatedHosts, tmp_path: Path
+    flown: FrailHosts, tmp_path: Path
 ) -> None:
     arguments = ("pull", "--trial", "A", "--robots", "r1", "--out", tmp_path)
     done = lpac_fleet(flown.fleet_toml, *arguments)
@@ -96,7 +95,7 @@ def test_what_belongs_to_the_trial_comes_whole_and_only_once(
     assert flown[0].run("ls /var/tmp") == ""
 
 
-def test_a_robot_without_the_trial_says_so(flown: SimulatedHosts, tmp_path: Path) -> None:
+def test_a_robot_without_the_trial_says_so(flown: FrailHosts, tmp_path: Path) -> None:
     done = lpac_fleet(
         flown.fleet_toml, "pull", "--trial", "Z", "--robots", "r1,r4", "--out", tmp_path
     )
@@ -106,7 +105,7 @@ def test_a_robot_without_the_trial_says_so(flown: SimulatedHosts, tmp_path: Path
     assert "pulled from 1 of 2 robots; failed: r1" in done.stderr
 
 
-def test_without_a_trial_comes_what_is_new(flown: SimulatedHosts, tmp_path: Path) -> None:
+def test_without_a_trial_comes_what_is_new(flown: FrailHosts, tmp_path: Path) -> None:
     host, folder = flown[0], tmp_path / "all" / "r1"
     first = fetch(flown, None, tmp_path)
     assert first.sent_bytes > 0
@@ -127,7 +126,7 @@ def test_without_a_trial_comes_what_is_new(flown: SimulatedHosts, tmp_path: Path
         (host.root / LOGS / "robot-1-0003.mcap").unlink()
 
 
-def test_a_cut_in_the_middle_is_made_up_for(flown: SimulatedHosts, tmp_path: Path) -> None:
+def test_a_cut_in_the_middle_is_made_up_for(flown: FrailHosts, tmp_path: Path) -> None:
     host = flown[0]
     big = os.urandom(BIG_BYTES)
     write_ulog(host, "sess009", FIRST_S + 11.0, big)
@@ -168,7 +167,7 @@ def test_a_cut_in_the_middle_is_made_up_for(flown: SimulatedHosts, tmp_path: Pat
         host.run("rm -r /data/px4/log/sess009")
 
 
-def test_a_log_that_grows_comes_as_far_as_it_is(flown: SimulatedHosts, tmp_path: Path) -> None:
+def test_a_log_that_grows_comes_as_far_as_it_is(flown: FrailHosts, tmp_path: Path) -> None:
     host = flown[0]
     host.run("systemctl start lpac-robot")
     log = host.root / LOGS / "robot-1-0003.mcap"
@@ -187,7 +186,7 @@ def test_a_log_that_grows_comes_as_far_as_it_is(flown: SimulatedHosts, tmp_path:
 
 
 def test_another_file_of_the_same_name_takes_nobodys_place(
-    flown: SimulatedHosts, tmp_path: Path
+    flown: FrailHosts, tmp_path: Path
 ) -> None:
     """Once its logs are removed, or its board is flashed anew, a robot numbers from 1 again."""
     host = flown[0]
@@ -221,7 +220,7 @@ def test_another_file_of_the_same_name_takes_nobodys_place(
         write_ulog(host, "sess003", FIRST_S + 112.0, b"of B")
 
 
-def test_a_robot_in_flight_is_left_alone(flown: SimulatedHosts, tmp_path: Path) -> None:
+def test_a_robot_in_flight_is_left_alone(flown: FrailHosts, tmp_path: Path) -> None:
     host = flown[0]
     with (
         armed(host),

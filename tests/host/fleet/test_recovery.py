@@ -7,15 +7,15 @@ import pytest
 
 from lpac.fleet.on_robot.service import UNIT
 from lpac.fleet.session import RemoteError
-from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.host.fleet.field import armed, deploy_to, lpac_fleet
 from tests.host.fleet.laptop import Laptop, boot_nonce
+from tests.host.hosts import FrailHosts
 
 OTHERS_UNIT = "/etc/systemd/system/lpac-robot.service.d/60-others.conf"
 
 
 @pytest.fixture(scope="module")
-def laptop(hosts: SimulatedHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
+def laptop(hosts: FrailHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
     """r1 runs a release."""
     laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
     # Of an image that is newer than the robot's, only files that differ travel.

@@ -8,21 +8,20 @@ import pytest
 from lpac.fleet.settings import load_fleet
 from lpac.fleet.swap import _callers
 from lpac.fleet.writer import assign
-from lpac.sim.hosts.host import SimulatedHost
-from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT
 from tests.host.fleet.field import SILENT, armed, await_said, deploy_to, lpac_fleet
+from tests.host.hosts import FrailHost, FrailHosts
 
 
 @pytest.fixture(scope="module")
-def deployed(hosts: SimulatedHosts) -> SimulatedHosts:
+def deployed(hosts: FrailHosts) -> FrailHosts:
     """r3, which flies, and r4, a spare, have the release."""
     deploy_to(hosts, "r3", "r4")
     return hosts
 
 
 @pytest.fixture
-def fleet_file(deployed: SimulatedHosts, tmp_path: Path) -> Path:
+def fleet_file(deployed: FrailHosts, tmp_path: Path) -> Path:
     """As it was at first, in a folder of its own."""
     for name in ("ssh_config", "world.env"):
         (tmp_path / name).symlink_to(deployed.folder / name)
@@ -31,7 +30,7 @@ def fleet_file(deployed: SimulatedHosts, tmp_path: Path) -> Path:
     return path
 
 
-def runs(host: SimulatedHost) -> tuple[str, str]:
+def runs(host: FrailHost) -> tuple[str, str]:
     """Whether the program runs, and whether it starts at boot."""
     return tuple(  # type: ignore[return-value]
         host.run(f"systemctl {ask} lpac-robot || true").strip()
@@ -40,7 +39,7 @@ def runs(host: SimulatedHost) -> tuple[str, str]:
 
 
 def test_nothing_is_touched_where_there_is_nothing_to_swap(
-    hosts: SimulatedHosts, fleet_file: Path
+    hosts: FrailHosts, fleet_file: Path
 ) -> None:
     for failed, spare, why in (
         ("r3", "r2", "r2 is no spare: it has slots[1]"),
@@ -67,9 +66,7 @@ def test_robots_with_larger_ids_may_not_know_a_spare() -> None:
     assert _callers(config, replace(config.robots["r11"], robot_id=0)) == ("r1", "r2", "r3")
 
 
-def test_a_spare_flies_instead_of_a_robot_that_answers(
-    hosts: SimulatedHosts, fleet_file: Path
-) -> None:
+def test_a_spare_flies_instead_of_a_robot_that_answers(hosts: FrailHosts, fleet_file: Path) -> None:
     r3, r4 = hosts[2], hosts[3]
     before = load_fleet(fleet_file).slots[2]
     text = fleet_file.read_text()
@@ -105,7 +102,7 @@ def test_a_spare_flies_instead_of_a_robot_that_answers(
 
 
 def test_an_interrupted_swap_for_a_robot_that_is_off_is_finished(
-    hosts: SimulatedHosts, fleet_file: Path
+    hosts: FrailHosts, fleet_file: Path
 ) -> None:
     r3, r4 = hosts[2], hosts[3]
     r3.power_off()

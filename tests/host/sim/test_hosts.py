@@ -16,9 +16,9 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from lpac.sim.hosts.base import SUITE, NoHostsError, base_tree
 from lpac.sim.hosts.host import new_key
-from lpac.sim.hosts.hosts import SimulatedHosts
 from lpac.sim.hosts.rack import children
 from tests.conftest import ROOT, SHIPPED
+from tests.host.hosts import FrailHosts
 
 CAP_SYS_TIME = 25
 # ssh's options where nobody is to answer.
@@ -38,14 +38,12 @@ while True:
 """
 
 
-def make(folder: Path, count: int, spares: int = 0) -> SimulatedHosts:
-    return SimulatedHosts(
-        count, folder, image=ROOT / "out/image/amd64", bundle=SHIPPED, spares=spares
-    )
+def make(folder: Path, count: int, spares: int = 0) -> FrailHosts:
+    return FrailHosts(count, folder, image=ROOT / "out/image/amd64", bundle=SHIPPED, spares=spares)
 
 
 @pytest.fixture(scope="module")
-def hosts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedHosts]:
+def hosts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FrailHosts]:
     with ExitStack() as stack:
         try:
             running = stack.enter_context(make(tmp_path_factory.mktemp("hosts"), 3, spares=1))
@@ -54,7 +52,7 @@ def hosts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedHosts]:
         yield running
 
 
-def ssh(hosts: SimulatedHosts, name: str, command: str, *options: str) -> tuple[int, str]:
+def ssh(hosts: FrailHosts, name: str, command: str, *options: str) -> tuple[int, str]:
     """Exit code, and all that was printed. Of an option given twice the first counts."""
     done = subprocess.run(
         ["ssh", "-F", hosts.ssh_config, *options, "-o", "BatchMode=yes", "-o", "ConnectTimeout=60",
@@ -65,7 +63,7 @@ def ssh(hosts: SimulatedHosts, name: str, command: str, *options: str) -> tuple[
     return done.returncode, done.stdout
 
 
-def heartbeat(hosts: SimulatedHosts, index: int) -> tuple[int, bool]:
+def heartbeat(hosts: FrailHosts, index: int) -> tuple[int, bool]:
     """System id and whether it is armed, as a program on the host hears it."""
     parser = mavlink.MAVLink(None)
     said = hosts[index].run(f"python3 - <<'END'\n{_LISTEN}END")
@@ -79,7 +77,7 @@ def heartbeat(hosts: SimulatedHosts, index: int) -> tuple[int, bool]:
     return heard[-1].get_srcSystem(), armed
 
 
-def test_ssh_login_with_checked_host_key(hosts: SimulatedHosts) -> None:
+def test_ssh_login_with_checked_host_key(hosts: FrailHosts) -> None:
     """By name and by address, as root; each host is another one under the same host name."""
     for host in hosts:
         assert ssh(hosts, host.name, "id -un; hostname") == (0, "root\nm0054\n")
@@ -87,7 +85,7 @@ def test_ssh_login_with_checked_host_key(hosts: SimulatedHosts) -> None:
     assert len({host.host_key for host in hosts}) == 3
 
 
-def test_wrong_keys_are_refused(hosts: SimulatedHosts, tmp_path: Path) -> None:
+def test_wrong_keys_are_refused(hosts: FrailHosts, tmp_path: Path) -> None:
     new_key(tmp_path / "other")
     code, said = ssh(
         hosts, hosts[0].address, "true", "-o", f"IdentityFile={tmp_path / 'other'}", "-F", "none",
@@ -101,7 +99,7 @@ def test_wrong_keys_are_refused(hosts: SimulatedHosts, tmp_path: Path) -> None:
     assert "Host key verification failed" in said
 
 
-def test_is_like_the_robots_computer(hosts: SimulatedHosts) -> None:
+def test_is_like_the_robots_computer(hosts: FrailHosts) -> None:
     if not base_tree(lambda _: None).name.startswith(SUITE):
         pytest.skip("Ubuntu's archive was not there: the hosts run Debian")
     assert hosts[0].run("python3 --version") == "Python 3.6.9\n"
@@ -111,21 +109,21 @@ def test_is_like_the_robots_computer(hosts: SimulatedHosts) -> None:
     assert hosts[0].run("systemctl is-system-running") == "running\n"
 
 
-def test_run_leaves_the_command_to_the_shell(hosts: SimulatedHosts) -> None:
+def test_run_leaves_the_command_to_the_shell(hosts: FrailHosts) -> None:
     command = "x=1; echo $x ${x} \"$HOME\" $(pwd) '%n $$' | cat; echo >&2 left out"
     assert hosts[0].run(command) == "1 1 /root /root %n $$\n"
     with pytest.raises(RuntimeError, match=r"r1: 'ls /none; exit 3' returned 3: .*No such file"):
         hosts[0].run("ls /none; exit 3")
 
 
-def test_hosts_cannot_set_the_clock_of_this_machine(hosts: SimulatedHosts) -> None:
+def test_hosts_cannot_set_the_clock_of_this_machine(hosts: FrailHosts) -> None:
     """They share it: nothing that is run on them has the capability."""
     command = "sed -n 's/^CapBnd:[[:space:]]*//p' /proc/self/status"
     for capabilities in (hosts[0].run(command), ssh(hosts, "r1", command)[1]):
         assert int(capabilities, 16) >> CAP_SYS_TIME & 1 == 0
 
 
-def test_vehicle_speaks_at_the_usual_place(hosts: SimulatedHosts) -> None:
+def test_vehicle_speaks_at_the_usual_place(hosts: FrailHosts) -> None:
     for index in (0, 1):
         assert heartbeat(hosts, index) == (index + 1, False)
     with hosts[0].stepped:
@@ -135,7 +133,7 @@ def test_vehicle_speaks_at_the_usual_place(hosts: SimulatedHosts) -> None:
     assert heartbeat(hosts, 1) == (2, False)
 
 
-def test_hosts_hear_each_other_until_the_network_is_cut(hosts: SimulatedHosts) -> None:
+def test_hosts_hear_each_other_until_the_network_is_cut(hosts: FrailHosts) -> None:
     ping = f"ping -c 1 -W 30 {hosts[1].address}"
     assert "1 received" in hosts[0].run(ping)
     hosts[1].cut()
@@ -148,7 +146,7 @@ def test_hosts_hear_each_other_until_the_network_is_cut(hosts: SimulatedHosts) -
     assert ssh(hosts, "r2", "true")[0] == 0
 
 
-def test_power_loss_keeps_the_disk_and_the_parameters(hosts: SimulatedHosts) -> None:
+def test_power_loss_keeps_the_disk_and_the_parameters(hosts: FrailHosts) -> None:
     host = hosts[0]
     before = host.run("echo kept >/root/note; sleep 1000 >/dev/null 2>&1 & cat /etc/machine-id")
     boot = host.run("cat /proc/sys/kernel/random/boot_id")
@@ -166,7 +164,7 @@ def test_power_loss_keeps_the_disk_and_the_parameters(hosts: SimulatedHosts) -> 
     assert heartbeat(hosts, 0) == (77, False)
 
 
-def test_reset_gives_a_new_disk_to_the_same_host(hosts: SimulatedHosts) -> None:
+def test_reset_gives_a_new_disk_to_the_same_host(hosts: FrailHosts) -> None:
     host = hosts[0]
     before = host.run("touch /root/mine; cat /etc/machine-id")
     host.cut()
@@ -175,7 +173,7 @@ def test_reset_gives_a_new_disk_to_the_same_host(hosts: SimulatedHosts) -> None:
     assert heartbeat(hosts, 0) == (1, False)
 
 
-def test_full_disk(hosts: SimulatedHosts) -> None:
+def test_full_disk(hosts: FrailHosts) -> None:
     write = "dd if=/dev/zero of=/opt/block bs=1M count=1"
     hosts[0].fill_disk()
     with pytest.raises(RuntimeError, match="No space left on device"):
@@ -185,7 +183,7 @@ def test_full_disk(hosts: SimulatedHosts) -> None:
     hosts[0].run(write)
 
 
-def test_fleet_toml_describes_the_hosts(hosts: SimulatedHosts) -> None:
+def test_fleet_toml_describes_the_hosts(hosts: FrailHosts) -> None:
     fleet = tomllib.loads(hosts.fleet_toml.read_text())
     assert {name: table["host"] for name, table in fleet["robots"].items()} == {
         host.name: host.address for host in hosts
@@ -196,7 +194,7 @@ def test_fleet_toml_describes_the_hosts(hosts: SimulatedHosts) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_hosts_go_when_their_program_does(
-    hosts: SimulatedHosts, tmp_path: Path, number: signal.Signals
+    hosts: FrailHosts, tmp_path: Path, number: signal.Signals
 ) -> None:
     """However it ends; those of another program stay."""
     with (

@@ -22,11 +22,10 @@ from lpac.ground.station.protocol import Enable, SafetyCommand, SetOrigin, Takeo
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.hosts.base import NoHostsError
-from lpac.sim.hosts.host import SimulatedHost
-from lpac.sim.hosts.hosts import SimulatedHosts
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
 from tests.host.fleet.field import name_robot
+from tests.host.hosts import FrailHost, FrailHosts
 
 UNIT = ROOT / "systemd" / "lpac-robot.service"
 LAND_UNIT = ROOT / "systemd" / "lpac-land.service"
@@ -34,14 +33,12 @@ UNITS = (UNIT, LAND_UNIT)
 
 
 @pytest.fixture(scope="module")
-def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedHosts]:
+def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[FrailHosts]:
     """One robot's computer, with a release and the unit, which does not run."""
     with ExitStack() as stack:
         try:
             running = stack.enter_context(
-                SimulatedHosts(
-                    1, tmp_path_factory.mktemp("hosts"), image=amd64_image, bundle=SHIPPED
-                )
+                FrailHosts(1, tmp_path_factory.mktemp("hosts"), image=amd64_image, bundle=SHIPPED)
             )
         except NoHostsError as reason:
             pytest.skip(str(reason))
@@ -62,22 +59,22 @@ def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 @pytest.fixture
-def config(hosts: SimulatedHosts) -> FleetConfig:
+def config(hosts: FrailHosts) -> FleetConfig:
     return load_fleet(hosts.fleet_toml)
 
 
 @pytest.fixture
-def host(hosts: SimulatedHosts) -> SimulatedHost:
+def host(hosts: FrailHosts) -> FrailHost:
     return hosts[0]
 
 
-def shown(host: SimulatedHost, *properties: str) -> dict[str, str]:
+def shown(host: FrailHost, *properties: str) -> dict[str, str]:
     """The unit's properties."""
     output = host.run(f"systemctl show lpac-robot -p {','.join(properties)}")
     return dict(line.split("=", 1) for line in output.splitlines())
 
 
-def status(host: SimulatedHost) -> dict[str, Any]:
+def status(host: FrailHost) -> dict[str, Any]:
     """What the robot told systemd last; empty if nothing."""
     text = shown(host, "StatusText")["StatusText"]
     told: dict[str, Any] = json.loads(text or "{}")
@@ -91,27 +88,27 @@ def wait_until(condition: Callable[[], object], timeout_s: float = 180.0) -> Non
         time.sleep(0.05)
 
 
-def journal(host: SimulatedHost, options: str = "") -> str:
+def journal(host: FrailHost, options: str = "") -> str:
     """What is in the unit's journal so far: it is written a moment later."""
     return host.run(f"journalctl --unit lpac-robot --output cat {options}")
 
 
-def is_in_journal(host: SimulatedHost, text: str) -> bool:
+def is_in_journal(host: FrailHost, text: str) -> bool:
     return text in journal(host)
 
 
-def events(host: SimulatedHost) -> list[str]:
+def events(host: FrailHost) -> list[str]:
     """What the program has logged so far."""
     lines = journal(host, "--identifier lpac-robot").splitlines()
     return [json.loads(line)["event"] for line in lines if line.startswith("{")]
 
 
-def processes(host: SimulatedHost, pid: str) -> list[str]:
+def processes(host: FrailHost, pid: str) -> list[str]:
     """The command lines of a process and of those that it started."""
     return host.run(f"ps -o args= --pid {pid} --ppid {pid} || true").splitlines()
 
 
-def test_a_spare_has_nothing_to_start(host: SimulatedHost, config: FleetConfig) -> None:
+def test_a_spare_has_nothing_to_start(host: FrailHost, config: FleetConfig) -> None:
     toml = host.root / config.directory.lstrip("/") / "current/robot.toml"
     text = toml.read_text()
     toml.unlink()
@@ -123,7 +120,7 @@ def test_a_spare_has_nothing_to_start(host: SimulatedHost, config: FleetConfig) 
     toml.write_text(text)
 
 
-def test_it_starts_says_how_it_is_and_ends(host: SimulatedHost) -> None:
+def test_it_starts_says_how_it_is_and_ends(host: FrailHost) -> None:
     # It returns once each loop has ticked.
     host.run("systemctl start lpac-robot")
     wait_until(lambda: status(host))
@@ -154,7 +151,7 @@ def test_it_starts_says_how_it_is_and_ends(host: SimulatedHost) -> None:
     assert "px4.watchdog" not in host.run("ps -eo args=")
 
 
-def look_at_the_sandbox(host: SimulatedHost, pid: str) -> None:
+def look_at_the_sandbox(host: FrailHost, pid: str) -> None:
     """Not root, no capability, nothing to write to but its state and its own /tmp."""
     lines = (line.split(None, 1) for line in host.run(f"cat /proc/{pid}/status").splitlines())
     facts = {line[0]: line[1] for line in lines if len(line) == 2}
@@ -172,7 +169,7 @@ def look_at_the_sandbox(host: SimulatedHost, pid: str) -> None:
 
 
 def test_a_program_that_hangs_in_flight_is_restarted_and_leaves_the_vehicle_in_hold(
-    hosts: SimulatedHosts, host: SimulatedHost, config: FleetConfig
+    hosts: FrailHosts, host: FrailHost, config: FleetConfig
 ) -> None:
     with host.stepped:
         host.vehicle.parameters |= {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0}
@@ -195,7 +192,7 @@ def test_a_program_that_hangs_in_flight_is_restarted_and_leaves_the_vehicle_in_h
 
 
 def test_a_program_that_cannot_start_is_given_up_and_its_vehicle_landed(
-    host: SimulatedHost, config: FleetConfig
+    host: FrailHost, config: FleetConfig
 ) -> None:
     """In the air, in hold, as the test before left it."""
     toml = host.root / config.directory.lstrip("/") / "current/robot.toml"
@@ -237,7 +234,7 @@ def take_off(ground: GroundProgram) -> None:
             ground.command(SafetyCommand("land", wait=True))
 
 
-def test_it_lives_where_the_drop_in_says(host: SimulatedHost, config: FleetConfig) -> None:
+def test_it_lives_where_the_drop_in_says(host: FrailHost, config: FleetConfig) -> None:
     elsewhere = dataclasses.replace(config, directory="/data/lpac")
     for name, text in drop_ins(elsewhere, config.robots[host.name]).items():
         path = host.root / f"etc/systemd/system/{Path(name).stem}.service.d" / name
@@ -253,7 +250,7 @@ def test_it_lives_where_the_drop_in_says(host: SimulatedHost, config: FleetConfi
     host.run("systemctl stop lpac-robot")
 
 
-def test_nothing_was_added_to_the_release(host: SimulatedHost, amd64_image: Path) -> None:
+def test_nothing_was_added_to_the_release(host: FrailHost, amd64_image: Path) -> None:
     def names(tree: Path) -> set[Path]:
         return {path.relative_to(tree) for path in tree.rglob("*")}
 

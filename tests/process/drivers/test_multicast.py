@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from edge.drivers import multicast
-from edge.drivers.radio import zenoh_radio
+from edge.drivers.link import zenoh_link
 from edge.drivers.zenoh_link import ZenohLink, ZenohRouter
 from edge.identity.card import Card, Revocations, Role, signed
 from edge.identity.envelope import Address, seal
@@ -61,7 +61,7 @@ class Robot:
         signer, card = signer_and_card(robot_id, enrolled)
         membership = Membership(AUTHORITY.public_key, signer, signed(card, AUTHORITY), start)
         self.guard = SignedGuard(membership, clock_s)
-        self.radio = zenoh_radio(
+        self.radio = zenoh_link(
             LinkSetting(
                 "test", robot_id, "client", (), (at or endpoint(),), False, {},
                 self.guard.subscriptions({MESSAGE: self._hear}), None, group,
@@ -139,7 +139,7 @@ def test_cards_are_shown_in_haste_since_nothing_lost_is_sent_again(group: Group)
         "test", None, "client", (), (endpoint(),), False, {},
         {MESSAGE: messages, CARD: cards}, None, group,
     )  # fmt: skip
-    with zenoh_radio(setting), Robot(group, 1, clock_s=lambda: now_s) as robot:
+    with zenoh_link(setting), Robot(group, 1, clock_s=lambda: now_s) as robot:
 
         def heard() -> bool:
             robot.link.publish(MESSAGE, b"")

@@ -15,8 +15,8 @@ import pytest
 from edge.messages.topics import MESSAGE, Topic
 from lpac.ground.station.protocol import SetOrigin
 from lpac.radio.records import read_records
+from lpac.sim.air import Subscriptions
 from lpac.sim.fleet.robots import OpenLink, SimulatedRobot
-from lpac.sim.radio import Subscriptions
 from tests.host.fleet.field import lpac_fleet
 from tests.live import ORIGIN, FlownFleet
 from tests.process.ground.conftest import GroundStation, all_heard

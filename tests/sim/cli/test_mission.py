@@ -28,9 +28,9 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
+from lpac.sim.air import RadioLink
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
-from lpac.sim.radio import RadioLink
 from lpac.sim.scenario import Scenario
 from tests.command import called
 from tests.conftest import ROOT, SHIPPED
@@ -213,16 +213,18 @@ def test_operators_mistakes_are_one_line_each(field: Commanded, tmp_path: Path) 
     assert "is unknown; known are r0, r1, r2" in refused("mission", "hold", "--robots", "r7")
     assert "is unknown; known are" in refused("mission", "kill", "r7", "--yes")
     assert refused("mission", "origin", "48", "11", "360") == (
-        "origin: heading_deg = 360.0: must be in [0, 360)"
+        "origin: heading_deg = 360.0: must be at least 0 and below 360"
     )
-    assert "origin: mission origin latitude = 91.0 deg: must be in [-90, 90]" in refused(
+    assert "origin: latitude_deg = 91.0: must be from -90 to 90" in refused(
         "mission", "origin", "91", "11", "0"
     )
     assert "LAT LON HEADING_DEG, or --from ROBOT" in refused("mission", "origin", "48", "11")
     assert "not both" in refused("mission", "origin", *AT, "--from", "r1")
     assert "'r9' is unknown" in refused("mission", "origin", "--from", "r9")
     assert "fence set: '3': must be X,Y" in refused("mission", "fence", "set", "3", "4,5")
-    assert "fence set: vertices_m has 2" in refused("mission", "fence", "set", "3,3", "4,5")
+    assert "fence set: vertices_m = [(3.0, 3.0), (4.0, 5.0)]: must be 3 to 100 long" in refused(
+        "mission", "fence", "set", "3,3", "4,5"
+    )
     assert "--yes" in refused("mission", "fence", "off")
     assert "--yes" in refused("mission", "kill", "r1")
     assert "--yes" in refused("mission", "kill", "--robots", "r1")

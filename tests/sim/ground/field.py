@@ -26,12 +26,12 @@ from lpac.ground.station.protocol import (
     Takeoff,
 )
 from lpac.ground.station.station import Station
+from lpac.sim.air import Air
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.robots import SimulatedRobot
 from lpac.sim.fleet.simulated import SimulatedFleet
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
-from lpac.sim.radio import Air
 from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 from tests.flown import PRECISE, QUICK, FlownRobot

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.stolen_key import Lie, harms, held_up, ready_fleet
 from edge.identity.card import Role
 from edge.messages.codec import encode
 from edge.messages.codes import ReasonCode
@@ -30,6 +29,7 @@ from lpac.sim.fleet.members import SimulatedMembers
 from lpac.sim.fleet.simulated import EPOCH_S
 from tests.flown import FlownRobot
 from tests.sim.ground.field import Field, a_field
+from tests.sim.ground.stolen_key import Lie, harms, held_up, ready_fleet
 
 _S = FlightState
 # On the radio, as a ground and as a robot.
@@ -203,7 +203,7 @@ def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
 
 @pytest.mark.slow
 def test_a_stolen_robots_lies_move_nobody_beyond_the_limits(tmp_path: Path) -> None:
-    lies = (Lie.BESIDE_EACH, Lie.BOTH)
+    lies = (Lie.BESIDE_ONE, Lie.BESIDE_EACH, Lie.PAYLOAD, Lie.BOTH)
     ready = ready_fleet(2, 1, tmp_path)
     hovering = ready.copy()
     assert hovering.ground.command(Takeoff(interval_s=0.0)).done

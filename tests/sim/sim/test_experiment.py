@@ -122,6 +122,16 @@ def test_the_policy_covers_better_than_what_knows_as_much(shipped_bundle: Bundle
     assert policy < 0.8 * other
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("robots", "loss"), [(2, 0.0), (10, 0.3), (20, 0.0)])
+def test_no_honest_payload_comes_near_the_limit(
+    shipped_bundle: Bundle, robots: int, loss: float
+) -> None:
+    limit = shipped_bundle.manifest.payload_limit
+    flight = fly(Scenario(robots=robots, loss=loss, duration_s=60.0), shipped_bundle)
+    assert limit is not None and 0.0 < flight.largest_payload < 1.05 * limit / 10.0
+
+
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("robots", [1, 2])
 def test_one_robot_and_two_at_one_point(

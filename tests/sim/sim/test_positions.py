@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench.position import READY_S, TICK_S, Watched
 from edge.core.position import PositionCause, PositionQuality
 from lpac.sim.px4.estimator import GPS_REJECTED_S
 from lpac.sim.px4.vehicle import Px4Vehicle, SimulatedSensor
+from tests.sim.sim.watched import READY_S, TICK_S, Watched
 
 _Q = PositionQuality
 
 
-def flying() -> Watched:
-    watched = Watched(seed=5, endurance_s=1200.0)
+def flying(seed: int = 5) -> Watched:
+    watched = Watched(seed, endurance_s=1200.0)
     while watched.vehicle.time_s < READY_S:
         watched.tick()
     assert watched.vehicle.armed and watched.judgement.quality is _Q.GOOD
@@ -147,3 +147,11 @@ def test_a_good_receiver_is_noisy_late_and_believed() -> None:
     vehicle = watched.vehicle
     assert 8 <= vehicle.gps_satellites <= 16
     assert 0.8 <= vehicle.gps_accuracy_m[0] <= 1.4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_a_good_position_is_never_doubted(seed: int) -> None:
+    watched = flying(seed)
+    assert run(watched, 300.0) == []
+    assert watched.vehicle.armed and watched.greatest_offset_m < 5.0

@@ -25,8 +25,8 @@ from edge.policy.bundle import load_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import replay
 from edge.robot.readiness import Checks
+from lpac.analysis.examination import Examined, Wanted, examine
 from lpac.analysis.flight import FlightRecord
-from lpac.analysis.report import Examined, Wanted, examine
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from lpac.ground.procedure import Procedure, Until
 from lpac.ground.script import ScriptListener, ScriptRun, load_script
@@ -39,6 +39,7 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
+from lpac.sim.air import GROUND
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.layout import ORIGIN, Settings
@@ -48,7 +49,6 @@ from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon
-from lpac.sim.radio import GROUND
 from lpac.sim.scenario import Scenario
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE
@@ -740,7 +740,7 @@ def test_what_the_robots_logged_is_what_they_computed(logged: Logged) -> None:
 def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
     """To the last digit: `lpac report` has the logs, the flight what the robots said to them."""
     flight = logged.flight
-    (reported,) = examine([logged.folder], Wanted(), lambda *_: None).trials
+    (reported,) = examine([logged.folder], Wanted(), lambda *_: None).records
     told, summary = Examined((reported,), ()).summary()["trials"][0], flight.summary()
     for cost, truly in ((told["cost"], "cost"), (told["truth"]["cost"], "true_cost")):
         assert 0.0 < cost["final"] != cost["initial"]
@@ -766,7 +766,7 @@ def test_flights_beside_each_other_are_told_apart(tmp_path: Path, logged: Logged
     longer = fly_simulated(low_flight(2, 1, 6.0), tmp_path, SHARING, logs=True)
     flown = [logged.flight, longer]
     both = examine([logged.folder, tmp_path], Wanted(), lambda *_: None)
-    reported = sorted(both.trials, key=_duration_s)
+    reported = sorted(both.records, key=_duration_s)
     assert [_duration_s(r) for r in reported] == [_duration_s(f.record) for f in flown]
     for record, flight in zip(reported, flown, strict=True):
         np.testing.assert_equal(record.normalized, flight.record.normalized)

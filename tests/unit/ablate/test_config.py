@@ -94,7 +94,7 @@ def test_whatever_a_configuration_says_is_what_the_training_is_told(tmp_path: Pa
         ('"slow"', '"a/b"', r"variants\[1\]: name = 'a/b': must be letters, digits"),
         ('"Perception and policy are slow."', '" "', r"variants\[1\]: why = ' ': must be a sent"),
         ("fly.clocks = ", "# ", r"variants\[1\]: train, fly: one of them must say"),
-        ("fly.clocks = {", "fly.clocks = {jitter = 1, ", "slow: fly: clocks: jitter = 1.0: must"),
+        ("fly.clocks = {", "fly.clocks = {jitter = 1, ", "slow: fly: clocks: jitter = 1: must"),
         ("train.network.hops", "train.seed", "no-features: train.seed: is not to be set: it foll"),
         ("train.data", "train.export", r"parts\.toml: train.export: is not to be set"),
         ("train.network.hops = 0", "train.network.hops = -1", "no-features: network: hops = -1: "),

@@ -12,7 +12,7 @@ from edge.messages.mission import Origin
 from lpac.analysis.field_truth import read_places
 from lpac.analysis.truth import TRUTH, TrueTrack, write_truth
 from tests.ulog import HEADER, message
-from tests.unit.analysis.test_report import BEGAN_S, FIRST, IMPORTANCE, SCALE, Writer, examined
+from tests.unit.analysis.test_examination import BEGAN_S, FIRST, IMPORTANCE, SCALE, Writer, examined
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
 # How far the robots' positions are from the truth: x, y, m.
@@ -107,12 +107,12 @@ def test_what_lies_between_two_places_is_not_made_up(day: Path) -> None:
     path = day / "r0" / "truth.csv"
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:20] + lines[30:]))
-    (trial,) = examined(day).trials
+    (record,) = examined(day).records
     # Between two places each; they are known until the first that is missing.
     at_s = TIMES_S[18:31] - FIRST.begin_s - 0.1
-    known = np.isfinite(trial.truth["r0"].positions_at(at_s)[:, 0])
+    known = np.isfinite(record.truth["r0"].positions_at(at_s)[:, 0])
     assert known[0] and known[-1] and not known[1:-1].any()
-    assert np.isfinite(trial.truth["r1"].places_at(at_s)).all()
+    assert np.isfinite(record.truth["r1"].places_at(at_s)).all()
 
 
 def test_a_simulation_knows_better(day: Path) -> None:
@@ -120,8 +120,8 @@ def test_a_simulation_knows_better(day: Path) -> None:
     times_s = BEGAN_S + TIMES_S
     standing = TrueTrack(times_s, np.zeros((len(times_s), 3)), np.ones(len(times_s), bool))
     write_truth({0: standing}, day / TRUTH)
-    (trial,) = examined(day).trials
-    assert not trial.truth["r0"].position_m.any()
+    (record,) = examined(day).records
+    assert not record.truth["r0"].position_m.any()
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from tests.conftest import SHIPPED
         (["sim", "--position-error", "-1"], "--position-error -1: must be at least 0"),
         (["sim", "--lost", "10@5"], "lost robots 10@5: must be fewer than the team's 10"),
         (["sim", "--lost", "2@60"], "robot 8 is gone from 60 s on: must be within the flight"),
-        (["sim", "--range", "0"], "--range 0.0: must be positive and finite"),
+        (["sim", "--range", "0"], "--range 0.0: must be above 0 and finite"),
         (["sim", "--secure"], "--secure does nothing with --vehicle point"),
         (["sim", "--no-script"], "--no-script does nothing with --vehicle point"),
         (["sim", "--world", "a.env", "--features", "3"], "--features does nothing with --world"),
@@ -41,14 +41,17 @@ from tests.conftest import SHIPPED
         ),
         (
             ["sim", "--vehicle", "simulated", "--control-hz", "1"],
-            "lpac: fleet.toml: robots.r0, in slots[0]: rates: --control-hz 1.0: PX4 needs",
+            "robots.r0, in slots[0]: rates: --control-hz 1.0: must be from 4 to 100: PX4 needs",
         ),
         (
             ["drill", "--sensor", "foo", "--fault", "none"],
             "sensor: type = 'foo': is not installed here",
         ),
         (["paper", "all", "--namespaces", "a,b"], "2 given, and 10 robots need one each"),
-        (["sim", "--away", "3@20-10"], "failure of robot 3: from_s = 20.0, until_s = 10.0: must"),
+        (
+            ["sim", "--away", "3@20-10"],
+            "failure of robot 3: until_s = 10.0: must be after from_s = 20.0",
+        ),
         (
             ["sim", "--lag", "1", "--vehicle", "mavlink"],
             "--lag does nothing with --vehicle mavlink",

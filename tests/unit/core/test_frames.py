@@ -209,13 +209,18 @@ def test_a_transform_cannot_be_changed() -> None:
 @pytest.mark.parametrize(
     ("latitude_deg", "longitude_deg", "heading_rad", "said"),
     [
-        (90.1, 0.0, 0.0, "mission origin latitude = 90.1 deg: must be in [-90, 90]"),
-        (math.nan, 0.0, 0.0, "mission origin latitude = nan deg: must be in [-90, 90]"),
-        (0.0, -180.5, 0.0, "mission origin longitude = -180.5 deg: must be in [-180, 180]"),
-        (0.0, math.inf, 0.0, "mission origin longitude = inf deg: must be in [-180, 180]"),
-        (0.0, 0.0, math.tau, "mission heading = 6.283185307179586 rad: must be in [0, 2 pi)"),
-        (0.0, 0.0, -0.1, "mission heading = -0.1 rad: must be in [0, 2 pi)"),
-        (0.0, 0.0, math.nan, "mission heading = nan rad: must be in [0, 2 pi)"),
+        (90.1, 0.0, 0.0, "latitude_deg = 90.1: must be from -90 to 90"),
+        (math.nan, 0.0, 0.0, "latitude_deg = nan: must be from -90 to 90"),
+        (0.0, -180.5, 0.0, "longitude_deg = -180.5: must be from -180 to 180"),
+        (0.0, math.inf, 0.0, "longitude_deg = inf: must be from -180 to 180"),
+        (
+            0.0,
+            0.0,
+            math.tau,
+            "heading_rad = 6.283185307179586: must be at least 0 and below 6.28319",
+        ),
+        (0.0, 0.0, -0.1, "heading_rad = -0.1: must be at least 0 and below 6.28319"),
+        (0.0, 0.0, math.nan, "heading_rad = nan: must be at least 0 and below 6.28319"),
     ],
 )
 def test_a_wrong_mission_frame_says_what_is_allowed(
@@ -238,7 +243,7 @@ def test_a_place_of_the_mission_frame_is_found_on_the_earth(
 
 def test_a_wrong_local_origin_says_what_is_allowed() -> None:
     with pytest.raises(
-        ValueError, match=r"^local origin latitude = nan deg: must be in \[-90, 90\]$"
+        ValueError, match=r"^local_origin_latitude_deg = nan: must be from -90 to 90$"
     ):
         MissionFrame(1.0, 2.0, 3.0).relative_to(math.nan, 2.0)
 
@@ -262,7 +267,7 @@ def test_model_scale_round_trip(position_m: F64, env_scale: float) -> None:
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
 def test_a_wrong_scale_is_named(value: float) -> None:
-    with pytest.raises(ValueError, match=f"^env_scale = {value}: must be finite and above 0$"):
+    with pytest.raises(ValueError, match=f"^env_scale = {value}: must be above 0 and finite$"):
         ModelScale(value, 1.0)
-    with pytest.raises(ValueError, match=f"^velocity_scale = {value}: must be finite and above 0$"):
+    with pytest.raises(ValueError, match=f"^velocity_scale = {value}: must be above 0 and finite$"):
         ModelScale(1.0, value)

@@ -237,7 +237,7 @@ def test_what_is_handed_out_does_not_change() -> None:
 @pytest.mark.parametrize("max_message_age_s", [-0.1, math.inf, math.nan])
 def test_a_wrong_age_limit_is_named(max_message_age_s: float) -> None:
     with pytest.raises(
-        ValueError, match=f"^max_message_age_s = {max_message_age_s}: must be finite"
+        ValueError, match=f"^max_message_age_s = {max_message_age_s}: must be at least 0 and finite"
     ):
         Mailbox(OWN_ID, max_message_age_s)
 

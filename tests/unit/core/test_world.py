@@ -305,14 +305,20 @@ GAUSSIAN_FIELDS = "(expected: x y sigma_x sigma_y rho scale)"
         ("BND nan 2 3 4 0 6", f"(BND): x is nan, must be a finite number {GAUSSIAN_FIELDS}"),
         ("BND 1e999 2 3 4 0 6", f"(BND): x is 1e999, must be a finite number {GAUSSIAN_FIELDS}"),
         ("BND 1_0 2 3 4 0 6", f"(BND): x is 1_0, must be a finite number {GAUSSIAN_FIELDS}"),
-        ("BND 1 2 3 0 0 6", "(BND): sigma_y is 0.0, must be > 0"),
-        ("CircularBND 1 2 -3 4", "(CircularBND): sigma_x is -3.0, must be > 0"),
-        ("BND 1 2 3 4 -1 6", "(BND): rho is -1.0, must be between -1 and 1, exclusive"),
-        ("CircularBND 1 2 3 -4", "(CircularBND): scale is -4.0, must be >= 0"),
+        ("BND 1 2 3 0 0 6", "(BND): sigma[1] = 0.0: must be above 0 and at most 1e+07"),
+        (
+            "CircularBND 1 2 -3 4",
+            "(CircularBND): sigma[0] = -3.0: must be above 0 and at most 1e+07",
+        ),
+        ("BND 1 2 3 4 -1 6", "(BND): correlation = -1.0: must be above -1 and below 1"),
+        ("CircularBND 1 2 3 -4", "(CircularBND): scale = -4.0: must be at least 0 and finite"),
         ("Uniform", "(Uniform): num_vertices is missing, must be a whole number >= 3"),
         ("Uniform 3.0 1", "(Uniform): num_vertices is 3.0, must be a whole number >= 3"),
         ("Uniform 2 1 0 0 1 1", "(Uniform): num_vertices is 2, must be a whole number >= 3"),
-        ("Uniform 3 -1\n0 0\n1 1\n0 1", "(Uniform): importance is -1.0, must be >= 0"),
+        (
+            "Uniform 3 -1\n0 0\n1 1\n0 1",
+            "(Uniform): importance = -1.0: must be at least 0 and finite",
+        ),
         (
             "Uniform 3 1 0 0 1 1 5",
             "(Uniform): y3 is missing, must be a finite number (expected: x3 y3)",
@@ -327,7 +333,7 @@ def test_a_faulty_file_is_refused_in_one_line(record: str, message: str) -> None
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_features_must_be_finite(bad: float) -> None:
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ValueError, match=rf"^mean\[0\] = {bad}: must be from -1e\+07 to 1e\+07$"):
         GaussianFeature((bad, 0.0), (1.0, 1.0))
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ValueError, match=rf"^vertices\[1\]\[1\] = {bad}: must be from -1e\+07 to"):
         PolygonFeature(((0.0, 0.0), (1.0, bad), (1.0, 0.0)), 1.0)

@@ -145,7 +145,7 @@ def test_coverage_control_keys(tmp_path: Path) -> None:
         ("SensorSize = 32", "SensorSize = 32.0", "[RobotModel] SensorSize = 32.0: expected int"),
         ("Norm = 4", "Norm = true", "[Environment.IDF] Norm = True: expected float"),
         ("[RobotModel]", "[Robot]", "[RobotModel] SensorSize is missing"),
-        ("TimeStep = 0.1", "TimeStep = 0", "training: time_step = 0.0: must be positive"),
+        ("TimeStep = 0.1", "TimeStep = 0", "training: time_step = 0.0: must be above 0"),
     ],
 )
 def test_coverage_control_mistakes(old: str, new: str, line: str, tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_coverage_control_mistakes(old: str, new: str, line: str, tmp_path: Path
         ("world_size = 300", "", "perception: world_size is missing"),
         ("world_size", "size", "perception: unknown key 'size'; known are world_size, "),
         ("[training]", "[train]", "unknown key 'train'; known are perception, training"),
-        ("max_speed = 3", "max_speed = -3", "training: max_speed = -3.0: must be positive"),
+        ("max_speed = 3", "max_speed = -3", "training: max_speed = -3: must be above 0"),
         ("max_speed = 3", "max_speed = ", "is not TOML: Invalid value (at line 8, column 13)"),
     ],
 )

@@ -488,7 +488,7 @@ def test_receivers_with_corrections_stand_nearer_as_long_as_they_report_it() -> 
         ({"min_battery": 0.0}, "min_battery = 0.0: must be above 0 and at most 1"),
         ({"min_battery": 50.0}, "min_battery = 50.0"),
         ({"min_satellites": 3}, "min_satellites = 3: must be at least 4"),
-        ({"max_hdop": math.inf}, "max_hdop = inf: must be finite and above 0"),
+        ({"max_hdop": math.inf}, "max_hdop = inf: must be above 0 and finite"),
         ({"max_position_age_s": 0.0}, "max_position_age_s = 0.0"),
         ({"max_ground_age_s": math.nan}, "max_ground_age_s = nan"),
         ({"max_time_uncertainty_s": -1.0}, "max_time_uncertainty_s = -1.0"),

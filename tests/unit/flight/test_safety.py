@@ -259,9 +259,15 @@ def test_fence_distance_of_a_square() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"vertices_m": [[0, 0], [1, 0]]}, "vertices_m has 2 vertices: must be 3 to 100"),
-        ({"vertices_m": [[0, 0], [9, 0], [9]]}, r"vertices_m has \[9.0\]"),
-        ({"vertices_m": [[0, 0], [9, 0], [9, math.nan]]}, r"vertices_m has \[9.0, nan\]"),
+        (
+            {"vertices_m": [[0, 0], [1, 0]]},
+            r"vertices_m = \[\[0, 0\], \[1, 0\]\]: must be 3 to 100 long",
+        ),
+        ({"vertices_m": [[0, 0], [9, 0], [9]]}, r"vertices_m\[2\] = \[9\]: must be \[x, y\]"),
+        (
+            {"vertices_m": [[0, 0], [9, 0], [9, math.nan]]},
+            r"vertices_m\[2\]\[1\] = nan: must be from -10000 to 10000",
+        ),
         ({"vertices_m": [[0, 0], [9, 9], [18, 18]]}, "convex"),
         ({"vertices_m": [[0, 0], [9, 0], [9, 0], [0, 9]]}, "none twice"),
         ({"vertices_m": [[0, 0], [20, 0], [20, 20], [15, 5]]}, "convex"),
@@ -277,9 +283,9 @@ def test_fence_distance_of_a_square() -> None:
             "convex",
         ),
         ({"buffer_m": 16.0}, "buffer_m = 16.0: must be below 16"),
-        ({"buffer_m": 0.0}, "buffer_m = 0.0: must be finite and above 0"),
-        ({"floor_m": -1.0}, "floor_m = -1.0: must be finite and at least 0"),
-        ({"ceiling_m": 3.0}, "ceiling_m = 3.0: must be finite and above floor_m"),
+        ({"buffer_m": 0.0}, "buffer_m = 0.0: must be above 0 and finite"),
+        ({"floor_m": -1.0}, "floor_m = -1.0: must be at least 0 and finite"),
+        ({"ceiling_m": 3.0}, "ceiling_m = 3.0: must be above floor_m"),
     ],
 )
 def test_a_fence_that_makes_no_sense_is_refused_by_name(

@@ -84,15 +84,15 @@ def test_examples_comments_show_the_defaults(script: Path) -> None:
     [
         ("trials = 3", "trials = 0", "trials = 0: must be from 1 to 1000"),
         ("trials = 3", "trails = 3", "unknown key 'trails'; known are trial, trials, robots"),
-        ('trial = "paper"', 'trial = "a b"', "trial = 'a b': must be 1 to 24 letters"),
+        ('trial = "paper"', 'trial = "a b"', "trial = 'a b': must be at most 24 letters"),
         ('do = "takeoff"', 'do = "go"', r"steps\[1\]: do = 'go': allowed are 'preflight', 'take"),
         ('do = "takeoff"', 'do = "world"', r"steps\[1\]: do = 'world': allowed are 'preflight'"),
         ('do = "takeoff"', "interval_s = 1", r"steps\[1\]: do = '': allowed are"),
-        ("# interval_s = 2.0", "interval_s = -1", r"steps\[1\] \(takeoff\): interval_s = -1.0"),
+        ("# interval_s = 2.0", "interval_s = -1", r"steps\[1\] \(takeoff\): interval_s = -1: must"),
         ("# interval_s", "intervall_s", r"steps\[1\] \(takeoff\): unknown key 'intervall_s'"),
         ("duration_s = 120.0", "", r"steps\[2\] \(mission\): duration_s is missing"),
         ("duration_s = 120.0", 'duration_s = ""', r"\(mission\): duration_s = '': expected float"),
-        ("at_s = 80.0", "at_s = 121.0", "perturb: at_s = 121.0: must be 0 or above"),
+        ("at_s = 80.0", "at_s = 121.0", "perturb: at_s = 121.0: must be below duration_s = 120.0"),
         ('do = "rejoin"', 'do = "kill"', r"perturb\[1\]: do = 'kill': allowed are 'pilot', "),
         ("heading_deg = 30.0", "heading_deg = 360.0", r"before\[0\] \(origin\): heading_deg = "),
         ("heading_deg = 30.0", 'heading_deg = 30.0\ntoward_robot = "r2"',
@@ -131,7 +131,7 @@ def test_worlds_sites_and_steps_must_be_there(script: Path) -> None:
     with pytest.raises(ValueError, match=r"park.toml: there is no such site; known are none"):
         load_script(script, Sites(script))
     script.write_text("trials = 2\n")
-    with pytest.raises(ValueError, match="steps: none are given"):
+    with pytest.raises(ValueError, match=r"steps = \[\]: must be one or more \[\[steps\]\] tables"):
         load_script(script, Sites(script))
     with pytest.raises(ValueError, match=r"none.toml: cannot be read: there is no such file"):
         load_script(script.with_name("none.toml"), Sites(script))

@@ -298,8 +298,8 @@ def test_site_is_read_as_it_was_saved(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "problem"),
     [
-        ("latitude_deg = -33.86", "latitude_deg = 91.0", "origin: mission origin latitude = 91"),
-        ("heading_deg = 359.99", "heading_deg = 360.0", r"heading_deg = 360.0: must be in \[0"),
+        ("latitude_deg = -33.86", "latitude_deg = 91.0", "origin: latitude_deg = 91.0: must be"),
+        ("heading_deg = 359.99", "heading_deg = 360.0", "= 360.0: must be at least 0 and below"),
         ("height = 3", "height = 0", "height 0: two slots have it"),
         ("pad_m = [2.0, 2.0]", "pad_m = [2.0, 200.0]", "height 0: pad_m = .*inside the fence"),
         ("[4.0, 4.0]", "[-1.0, 4.0]", r"height 0: landing_point_m = .*at least buffer_m = 1.5"),

@@ -3,14 +3,17 @@
 import ast
 import dataclasses
 import re
+import typing
 from collections.abc import Callable, Iterator
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
 
+from edge.core.schema import Bounded, bounds_of
 from edge.messages.topics import TOPICS
 from handbook import commands, configuration, interfaces, messages, pages
 from lpac import api
@@ -132,10 +135,32 @@ def test_every_key_is_in_the_reference(
 
 def test_keys_have_their_defaults_and_kinds() -> None:
     robot = configuration.robot()
-    assert "| `policy_hz` | number | `2.5` |" in robot
+    assert "| `policy_hz` | number (from 0.1 to 100) | `2.5` |" in robot
     assert '| `rc` | `"pilot"` or `"none"` | must be given |' in robot
     assert '| `type` | text | `"px4"` |' in robot
     assert "\n### [[data.worlds]]\n" in configuration.training()
+
+
+def test_bounds_of_a_file_hold_in_python_too_and_leave_no_number_infinite() -> None:
+    files = (
+        configuration.ROBOT, configuration.FLEET, configuration.GROUND, configuration.TRAINING,
+        configuration.MANIFEST,
+    )  # fmt: skip
+    for cls in (kind for each in chain(*files) for kind in read_kinds(each)):
+        bounds = bounds_of(cls)
+        assert not bounds or issubclass(cls, Bounded), cls
+        for name, meta in bounds.items():
+            if isinstance(meta.ge, float) or isinstance(meta.gt, float):
+                assert meta.le is not None or meta.lt is not None, (cls, name)
+
+
+def read_kinds(cls: Any) -> Iterator[Any]:
+    """A dataclass, and those within it."""
+    yield cls
+    for hint in typing.get_type_hints(cls).values():
+        for kind in (hint, *typing.get_args(hint)):
+            if dataclasses.is_dataclass(kind):
+                yield from read_kinds(kind)
 
 
 def test_every_topic_message_and_code_is_in_the_reference() -> None:
@@ -160,7 +185,7 @@ def test_interfaces_tell_calls_as_the_source_has_them() -> None:
         "TOLERANCE = 1e-5",
     ):
         assert f"```python\n{said}\n```" in text, said
-    assert "# Importance of what has not been seen yet.\nunknown_importance: float" in text
+    assert "# Importance of what has not been seen yet.\nunknown_importance: NonNegative" in text
     for name in re.findall(r"`([A-Z]\w+(?:Driver|Family))`", _GUIDE.read_text()):
         assert f"### {name}\n" in text, name
     for module, name in interfaces.names():

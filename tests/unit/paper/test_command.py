@@ -10,13 +10,13 @@ from typing import Any, cast
 
 import pytest
 
-import lpac.analysis.report
+import lpac.analysis.examination
 from edge.messages.mission import FlightState
 from edge.policy.bundle import load_bundle
 from lpac.analysis.coverage import Coverage
+from lpac.analysis.examination import Examined, Wanted
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.logs import LoggedStatus, LoopRates
-from lpac.analysis.report import Examined, Wanted
 from lpac.cli.options import DEFAULT_BUNDLE, VehicleKind
 from lpac.cli.paper import asynchrony, e1, e2, e3, transfer
 from lpac.evaluate.flights import BASELINES
@@ -57,11 +57,11 @@ def day(mission: FlightRecord, monkeypatch: pytest.MonkeyPatch) -> list[Wanted]:
     def examine(_: Sequence[Path], wanted: Wanted) -> Examined:
         asked.append(wanted)
         other = replace(mission, name="paper-2", coverage=None)
-        trials = [t for t in (mission, other) if not wanted.trials or t.name in wanted.trials]
+        trials = [t for t in (mission, other) if not wanted.missions or t.name in wanted.missions]
         note = f"paper-2: world 1234 is not here; give it with {wanted.world_option}"
         return Examined(tuple(trials), (note,))
 
-    monkeypatch.setattr(lpac.analysis.report, "examine", examine)
+    monkeypatch.setattr(lpac.analysis.examination, "examine", examine)
     return asked
 
 
@@ -72,7 +72,7 @@ def test_a_world_that_is_not_there_is_one_line_that_says_what_to_do(
         with pytest.raises(ValueError, match=r"^paper-2: .* with --world-file; or choose other"):
             command(logs=tmp_path, out=tmp_path / "out")
     e1(logs=tmp_path, trial=["paper-1"], world_file=Path("a.env"), out=tmp_path / "out")
-    assert (day[-1].trials, day[-1].world) == (("paper-1",), Path("a.env"))
+    assert (day[-1].missions, day[-1].world) == (("paper-1",), Path("a.env"))
 
 
 @pytest.mark.usefixtures("day")
@@ -112,7 +112,7 @@ def test_a_logged_flight_of_another_policy_has_no_baselines(
         for r in mission.robots
     )
     examined = Examined((replace(mission, robots=robots),), ())
-    monkeypatch.setattr(lpac.analysis.report, "examine", lambda *_: examined)
+    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
     e1(logs=tmp_path, out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
     assert [list(of_world) for of_world in told["worlds"].values()] == [["flight"]]
@@ -132,7 +132,7 @@ def test_of_a_day_with_two_policies_each_mission_is_looked_at_by_itself(
     )
     other = replace(mission, name="paper-0", robots=robots)
     examined = Examined((other, mission), ())
-    monkeypatch.setattr(lpac.analysis.report, "examine", lambda *_: examined)
+    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
     e1(logs=tmp_path, out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
     assert [len(of_world) for of_world in told["worlds"].values()] == [1, 1 + len(BASELINES)]
@@ -170,7 +170,7 @@ def test_missions_are_put_together_by_their_rates(
     record = replace(mission, duration_s=60.0, to_s=60.0, cost_time_s=minute_s, robots=robots)
     rates = {"paper-1": LoopRates(5.0, 2.5), "paper-2": LoopRates(5.0, 1.0), "paper-3": None}
     trials = tuple(replace(record, name=name, rates=its) for name, its in rates.items())
-    monkeypatch.setattr(lpac.analysis.report, "examine", lambda *_: Examined(trials, ()))
+    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: Examined(trials, ()))
     asynchrony(logs=Path("day 1"), out=tmp_path)
     assert "paper-3 is left out: its robots' rates differ" in capsys.readouterr().err
     told = json.loads((tmp_path / "async.json").read_text())
@@ -207,7 +207,7 @@ def test_neighbours_are_those_in_range_of_the_policy_that_flew(
         for r in mission.robots
     )
     examined = Examined((replace(mission, robots=robots),), ())
-    monkeypatch.setattr(lpac.analysis.report, "examine", lambda *_: examined)
+    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
     with pytest.raises(ValueError, match="is not what flew, 0123456789abcdef: give that with --b"):
         e3(logs=tmp_path, out=tmp_path)
 

@@ -191,7 +191,7 @@ def resealed(bundle: Bundle, folder: Path, change: dict[str, object]) -> Path:
         ({"geometry": {"hops": 0, "feature_sizes": [34, 256]}}, "hops = 0: must be at least 1"),
         ({"geometry": {"hops": 3}}, "geometry: feature_sizes is missing"),
         ({"images": None}, "images and perception: both or neither"),
-        ({"training": {"max_speed": -5.0, "time_step": 0.2}}, "max_speed = -5.0: must be positive"),
+        ({"training": {"max_speed": -5.0, "time_step": 0.2}}, "max_speed = -5.0: must be above 0"),
         ({"files": {}}, "action.onnx does not belong to the bundle"),
         ({"payload_types": ["int4"]}, "payload_types[0] = 'int4': allowed are 'float32'"),
         ({"opset": 20.5}, "opset = 20.5: expected int"),

@@ -347,7 +347,7 @@ def test_impossible_traffic_is_named(name: str, value: Any, allowed: str) -> Non
 
 def test_impossible_questions_are_named() -> None:
     unknown: Any = "pigeon"
-    with pytest.raises(ValueError, match=r"^transport = 'pigeon': must be one of mesh, router"):
+    with pytest.raises(ValueError, match=r"^transport = 'pigeon': allowed are 'mesh', 'router'"):
         airtime(unknown, WIFI, TEN)
     with pytest.raises(ValueError, match=r"^guests = 3: must be 0 in a mesh"):
         airtime("mesh", WIFI, replace(TEN, guests=3))
@@ -429,8 +429,8 @@ def test_it_asks_for_what_the_programs_links_took_of_emulated_air(
 
 def test_the_docs_tables_are_the_models() -> None:
     pytest.importorskip("matplotlib")
-    from lpac.radio.figures import tables  # noqa: PLC0415
+    from handbook.scaling import tables  # noqa: PLC0415
 
     text = (ROOT / "docs" / "scaling.md").read_text()
     for name, table in tables().items():
-        assert table in text, f"{name}: python -m lpac.radio.figures prints it anew"
+        assert table in text, f"{name}: python -m handbook.scaling prints it anew"

@@ -188,7 +188,7 @@ def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"max_speed_m_s": float("nan")}, "max_speed_m_s = nan: must be positive and finite"),
+        ({"max_speed_m_s": float("nan")}, "max_speed_m_s = nan: must be above 0 and finite"),
         ({"max_input_age_s": -1.0}, "max_input_age_s = -1.0"),
         ({"payload": "float64"}, "payload = 'float64'"),
     ],

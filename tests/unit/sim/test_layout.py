@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from edge.core.world import parse_world
+from edge.flight.margins import places_apart
 from edge.policy.bundle import Bundle
+from lpac.sim.description import ERRORS
 from lpac.sim.experiment import fly
-from lpac.sim.fleet.layout import APART_M, Layout
+from lpac.sim.fleet.layout import Layout
 from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 
@@ -18,10 +20,11 @@ from tests.conftest import SHIPPED
 @pytest.mark.parametrize("robots", [1, 10, 16])
 def test_where_a_fleet_stands(seed: int, robots: int) -> None:
     layout = Layout(Scenario(robots=robots, seed=seed), SHIPPED)
+    least_m = places_apart(ERRORS.position_m, ERRORS.position_m).least_m
     for places_m in (layout.pads_m, layout.landing_points_m):
         assert min(layout.fence.distance_m(x, y) for x, y in places_m) > layout.fence.buffer_m
         away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
-        assert away_m[~np.eye(robots, dtype=bool)].min(initial=np.inf) >= APART_M
+        assert away_m[~np.eye(robots, dtype=bool)].min(initial=np.inf) >= least_m
     true_m = [layout.to_mission.local_to_mission(each.position_m) for each in layout.vehicles]
     np.testing.assert_allclose(np.array(true_m)[:, :2], layout.pads_m, atol=1e-9)
     errors_m = np.linalg.norm(layout.landing_points_m - layout.pads_m, axis=1)

@@ -34,7 +34,7 @@ def test_synchronous_robots_tick_at_the_same_moments() -> None:
 
 @pytest.mark.parametrize(
     ("change", "text"),
-    [({"policy_s": 0.0}, "policy_s = 0.0: must be positive"), ({"jitter": 0.5}, "jitter = 0.5")],
+    [({"policy_s": 0.0}, "policy_s = 0.0: must be above 0"), ({"jitter": 0.5}, "jitter = 0.5")],
 )
 def test_impossible_clocks_are_named(change: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):

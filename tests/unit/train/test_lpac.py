@@ -220,7 +220,7 @@ def test_without_hops_nobody_heeds_what_is_said() -> None:
         ({"family": "none"}, "network: family = 'none': is not installed here"),
         ({"depth": 3}, "here: unknown key 'depth'; known are channels, "),
         ({"channels": ["importance"]}, "here: channels = importance: allowed are "),
-        ({"cnn_channels": []}, r"here: cnn_channels = \(\): must be one or more, above 0"),
+        ({"cnn_channels": []}, r"here: cnn_channels = \[\]: must be at least 1 long"),
         ({"hops": -1}, "here: hops = -1: must be at least 0"),
         ({"layers": 0}, "here: layers = 0: must be at least 1"),
         ({"image_size": 6}, "here: image_size = 6: must be above 6, what the convolutions"),

@@ -1,4 +1,4 @@
-"""The runs: fleets of programs, a bulk stream between the first two stations, and what is counted.
+"""The runs: fleets of programs, a bulk stream between the first two places, and what is counted.
 
 Middlewares take turns, run by run, so that whatever drifts meanwhile drifts for all of them.
 """
@@ -11,13 +11,21 @@ from pathlib import Path
 from threading import Lock
 from typing import NamedTuple, Self
 
-from lpac.network.middleware import NOTHING
-from lpac.network.results import CountedTime, Experiment, Reception, Run, Sent, of_traffic, traffic
-from lpac.network.stations import NetworkStation, News, Program
+from lpac.middleware.kinds import NOTHING
+from lpac.middleware.places import NetworkPlace, News, Program
+from lpac.middleware.results import (
+    CountedTime,
+    Experiment,
+    Reception,
+    Run,
+    Sent,
+    of_traffic,
+    traffic,
+)
 from lpac.sim.ports import free_ports
 
-# The ends of the stream; a fleet of one has a second station, too, where no program runs.
-STREAM_STATIONS = 2
+# The ends of the stream; a fleet of one has a second place, too, where no program runs.
+STREAM_PLACES = 2
 # How often all programs restart, and for how long then each message counts that arrives or not.
 RESTART_EVERY_S, AFTER_S = 15.0, 10.0
 # Of a short run's only round the last part is no window: what is said there could not arrive.
@@ -40,9 +48,9 @@ class Plan:
     seconds: float
 
     @property
-    def stations(self) -> int:
+    def places(self) -> int:
         """How many it needs."""
-        return max(STREAM_STATIONS, *self.robots)
+        return max(STREAM_PLACES, *self.robots)
 
     def runs(self) -> Iterator[tuple[int, int, str]]:
         """Repetition, robots, middleware, in the order in which they are made."""
@@ -59,29 +67,29 @@ class _Count(NamedTuple):
 
 @dataclass(slots=True)
 class _Robot:
-    """One station's, and what it has said since it was last asked."""
+    """One place's, and what it has said since it was last asked."""
 
     program: Program
     sent: list[Sent] = field(default_factory=list)
     heard: list[Reception] = field(default_factory=list)
 
 
-class NetworkFleet:
-    """A robot at each station. A context; its processes end with it.
+class MiddlewareFleet:
+    """A robot at each place. A context; its processes end with it.
 
-    What robots are told, and what they say, is in `lpac.network.robot`.
+    What robots are told, and what they say, is in `lpac.middleware.robot`.
     """
 
-    def __init__(self, stations: Sequence[NetworkStation]) -> None:
+    def __init__(self, places: Sequence[NetworkPlace]) -> None:
         self._news = News()
         self._lock = Lock()
         self._answers = 0
         self._robots: list[_Robot] = []
-        ports = free_ports(len(stations))
-        endpoints = [f"{s.address}:{port}" for s, port in zip(stations, ports, strict=True)]
+        ports = free_ports(len(places))
+        endpoints = [f"{s.address}:{port}" for s, port in zip(places, ports, strict=True)]
         with ExitStack() as stack:
-            for index, station in enumerate(stations):
-                stack.enter_context(self._program(index, station, endpoints))
+            for index, place in enumerate(places):
+                stack.enter_context(self._program(index, place, endpoints))
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -137,7 +145,7 @@ class NetworkFleet:
         for robot in self._robots:
             robot.program.check()
 
-    def _program(self, index: int, station: NetworkStation, endpoints: Sequence[str]) -> Program:
+    def _program(self, index: int, place: NetworkPlace, endpoints: Sequence[str]) -> Program:
         def hear(line: str) -> None:
             word, *numbers = line.split()
             values = [int(number) for number in numbers]
@@ -152,8 +160,8 @@ class NetworkFleet:
                 else:
                     self._answers += 1
 
-        command = ("lpac.network.robot", str(index), *endpoints)
-        robot = _Robot(Program(station, self._news, hear, *command))
+        command = ("lpac.middleware.robot", str(index), *endpoints)
+        robot = _Robot(Program(place, self._news, hear, *command))
         self._robots.append(robot)
         return robot.program
 
@@ -176,15 +184,15 @@ class NetworkFleet:
 
 
 class Stream:
-    """As much as TCP carries from one station to another. A context; its processes end with it."""
+    """As much as TCP carries from one place to another. A context; its processes end with it."""
 
-    def __init__(self, sender: NetworkStation, receiver: NetworkStation) -> None:
+    def __init__(self, sender: NetworkPlace, receiver: NetworkPlace) -> None:
         """Raises OSError if the one does not reach the other."""
         self._news = News()
         self._port: int | None = None
         self._counts: list[_Count] = []
         with ExitStack() as stack:
-            module = "lpac.network.stream"
+            module = "lpac.middleware.stream"
             self._receiver = stack.enter_context(
                 Program(receiver, self._news, self._hear, module, "receive", receiver.address)
             )
@@ -228,25 +236,25 @@ class Stream:
 
 
 def measure(
-    plan: Plan, stations: Sequence[NetworkStation], tell: Callable[[int, int, str], None]
+    plan: Plan, places: Sequence[NetworkPlace], tell: Callable[[int, int, str], None]
 ) -> Generator[Run, None, None]:
     """Each run as it is made; `tell` hears of each before. Who does not take all of them closes it.
 
     Raises OSError, one line, if a program fails.
     """
-    with NetworkFleet(stations[: plan.stations]) as fleet:
+    with MiddlewareFleet(places[: plan.places]) as fleet:
         for middleware in plan.middlewares:
             if middleware != NOTHING:
                 fleet.load(middleware)
         for repetition, robots, middleware in plan.runs():
             tell(repetition, robots, middleware)
-            yield _run(plan, fleet, stations, repetition, robots, middleware)
+            yield _run(plan, fleet, places, repetition, robots, middleware)
 
 
 def _run(
     plan: Plan,
-    fleet: NetworkFleet,
-    stations: Sequence[NetworkStation],
+    fleet: MiddlewareFleet,
+    places: Sequence[NetworkPlace],
     repetition: int,
     robots: int,
     middleware: str,
@@ -257,7 +265,7 @@ def _run(
     if speaks:
         fleet.start(middleware, robots, 0)
         met = fleet.meet(robots, 0)
-    with Stream(*stations[:STREAM_STATIONS]) as stream:
+    with Stream(*places[:STREAM_PLACES]) as stream:
         time.sleep(_STREAM_BEGINS_S)
         began, used = time.time(), _ProcessorUse()
         first = stream.count()

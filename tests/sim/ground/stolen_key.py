@@ -1,4 +1,4 @@
-"""What a stolen robot's key does to the others: how far it pushes them, what it holds up.
+"""A thief with a stolen robot's key: how far it pushes the others, and what it holds up.
 
 The thief is on the radio with the key of a robot that does not fly. It hears what the others say,
 and answers with lies in its own robot's name: that it is where they fly, and the largest numbers
@@ -6,24 +6,15 @@ that their policies take. Flights are on the simulated clock; each lie is told i
 that goes on undisturbed beside it, so that the difference is the lie's.
 """
 
-import tempfile
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
-from bench import BUNDLE
-from bench.report import Report, Table, Target
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
-from edge.core.logger import show
 from edge.core.wire import Rejection, decode, encode
 from edge.drivers.registry import load_policy
 from edge.identity.card import Role
@@ -34,21 +25,18 @@ from edge.messages.topics import MESSAGE, REVOKED
 from lpac.analysis.flight import least_separation
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.station.protocol import Enable, Request, SetOrigin, Start, Takeoff
-from lpac.sim.description import ERRORS
+from lpac.sim.air import GROUND
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
-from lpac.sim.radio import GROUND
 from lpac.sim.scenario import Scenario
+from tests.conftest import SHIPPED
 
-_CORES = 2
 _LIES_HZ = 20.0
 _BESIDE_M = 0.5
 # Who is above somebody brakes nobody, and is heeded by the policy of whoever is below.
 _ABOVE_M = 5.0
 _READY_S = 60.0
 _STEP_S = 0.5
-# Of a Starling 2, from propeller to propeller.
-_WIDEST_M = 0.4
 # The thief's program began after all others.
 _START = int(1e3 * (EPOCH_S + 3600.0))
 
@@ -172,7 +160,7 @@ class Thief:
 
 def ready_fleet(robots: int, seed: int, folder: Path) -> SimulatedFleet:
     """A fleet with keys, ready to take off. Raises RuntimeError if it does not get so far."""
-    fleet = SimulatedFleet(Scenario(robots=robots, seed=seed, secure=True), folder, BUNDLE)
+    fleet = SimulatedFleet(Scenario(robots=robots, seed=seed, secure=True), folder, SHIPPED)
     _until_all(fleet, lambda _: True)
     _do(fleet, SetOrigin(ORIGIN))
     _do(fleet, Enable())
@@ -300,110 +288,3 @@ def _harm(flown: _Flown, undisturbed: _Flown) -> Harm:
         ),
         down=flown.down,
     )
-
-
-_LIES = (Lie.NOTHING, Lie.BESIDE_ONE, Lie.BESIDE_EACH, Lie.PAYLOAD, Lie.BOTH)
-
-
-def measure(missions: int = 20, robots: int = 5, mission_s: float = 30.0) -> Report:
-    """Missions over worlds of their own."""
-    seeds = range(missions)
-    with ProcessPoolExecutor(_CORES, mp_context=get_context("spawn")) as processes:
-        results = list(
-            track(
-                processes.map(partial(_mission, robots, mission_s), seeds),
-                "stolen_key: missions",
-                missions,
-                console=Console(stderr=True),
-            )
-        )
-    of_lies = {lie: [harm[lie] for harm, _ in results] for lie in _LIES}
-    kept = [kept for _, kept in results]
-    all_harms = [harm for each in of_lies.values() for harm in each]
-    return Report(
-        "stolen_key",
-        {
-            "harms": {lie.name.lower(): [asdict(h) for h in each] for lie, each in of_lies.items()},
-            "held_up": [asdict(each) for each in kept],
-        },
-        [
-            Table(
-                f"What a thief says of itself in {missions} missions of {robots} robots, "
-                f"{mission_s:g} s each, and what becomes of the others",
-                (
-                    "says",
-                    "pushed by, m (median)",
-                    "at most",
-                    "least apart, m",
-                    "fastest, m/s",
-                    "inside the fence, m",
-                    "left the mission",
-                    "down",
-                ),
-                [_row(lie, each) for lie, each in of_lies.items()],
-            ),
-            Table(
-                "Missions in which a robot is kept by a thief that says that it takes off, too",
-                ("", "it lies", "it is revoked"),
-                [
-                    (
-                        "on the ground",
-                        f"{sum(each.on_the_ground > 0 for each in kept)} of {missions}",
-                        f"{sum(each.on_the_ground_after > 0 for each in kept)} of {missions}",
-                    ),
-                    (
-                        "from the mission",
-                        f"{sum(each.from_mission > 0 for each in kept)} of {missions}",
-                        f"{sum(each.from_mission_after > 0 for each in kept)} of {missions}",
-                    ),
-                ],
-            ),
-        ],
-        [
-            Target("robots that land or are disarmed", sum(h.down for h in all_harms), 0.0, False),
-            Target(
-                "furthest beyond the fence, of the position error",
-                max(-h.fence_m for h in all_harms) / ERRORS.position_m,
-                1.0,
-                at_least=False,
-            ),
-            Target(
-                "least apart, m", min(h.separation_m for h in all_harms), _WIDEST_M, at_least=True
-            ),
-            Target(
-                "fastest, of the same without a lie",
-                max(h.speed_m_s for h in all_harms)
-                / max(h.speed_m_s for h in of_lies[Lie.NOTHING]),
-                1.1,
-                at_least=False,
-            ),
-        ],
-        [
-            "Pushed: the most that a robot is from where it would be without the lie. In truth, "
-            "with the errors of receivers, and wind, as in `lpac sim`; the fence is one of the "
-            "estimate, so that a robot at its edge may truly be beyond it by the position error."
-        ],
-    )
-
-
-def _row(lie: Lie, harms: Sequence[Harm]) -> tuple[str, ...]:
-    pushed_m = [harm.pushed_m for harm in harms]
-    return (
-        lie,
-        f"{np.median(pushed_m):.1f}",
-        f"{max(pushed_m):.1f}",
-        f"{min(harm.separation_m for harm in harms):.2f}",
-        f"{max(harm.speed_m_s for harm in harms):.2f}",
-        f"{min(harm.fence_m for harm in harms):.1f}",
-        f"{sum(harm.left_mission for harm in harms)}",
-        f"{sum(harm.down for harm in harms)}",
-    )
-
-
-def _mission(robots: int, mission_s: float, seed: int) -> tuple[dict[Lie, Harm], HeldUp]:
-    show("error")
-    with tempfile.TemporaryDirectory() as folder:
-        ready = ready_fleet(robots, seed, Path(folder))
-        hovering = ready.copy()
-        _do(hovering, Takeoff(interval_s=0.0))
-        return harms(hovering.copy(), _LIES, seed, mission_s), held_up(ready, hovering, seed)

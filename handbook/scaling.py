@@ -1,4 +1,4 @@
-"""`python -m lpac.radio.figures`: docs/scaling.png, and the tables of docs/scaling.md to print."""
+"""`python -m handbook.scaling`: docs/scaling.png, and the tables of docs/scaling.md to print."""
 
 import math
 import sys

@@ -27,13 +27,13 @@ from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import load_bundle
 from lpac.analysis import figures
 from lpac.analysis.coverage import Coverage
+from lpac.analysis.examination import Examined, Wanted, examine
 from lpac.analysis.figures import overview
 from lpac.analysis.logs import read_logs
+from lpac.analysis.missions import find_missions, whole_record
 from lpac.analysis.page import Drawn, page
-from lpac.analysis.report import Examined, Wanted, examine
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.style import CURVES, SWARM, save
-from lpac.analysis.trials import find_missions, whole_record
 from lpac.analysis.write_report import write
 from lpac.cli.main import app
 from lpac.ground.record import TOPICS, GroundMetadata
@@ -206,7 +206,7 @@ def examined(*folders: Path, **wanted: Any) -> Examined:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two trials, from robots whose clocks are wrong, and from the ground."""
+    """Two missions, from robots whose clocks are wrong, and from the ground."""
     folder = tmp_path_factory.mktemp("flown")
     writer = Writer((FIRST, SECOND), ahead_s=(0.0, 3.0, -5000.0))
     writer.robots(folder)
@@ -222,11 +222,11 @@ def found(flown: Path) -> Examined:
 def test_a_mission_has_the_rates_that_all_of_its_robots_have(
     found: Examined, tmp_path: Path
 ) -> None:
-    assert [trial.rates for trial in found.trials] == [(5.0, 2.5), (5.0, 2.5)]
+    assert [record.rates for record in found.records] == [(5.0, 2.5), (5.0, 2.5)]
     writer = Writer((FIRST,))
     writer.rates[1] = {**writer.rates[1], "policy_hz": 1.0}
     writer.robots(tmp_path)
-    [differing] = examined(tmp_path).trials
+    [differing] = examined(tmp_path).records
     assert differing.rates is None
 
 
@@ -235,7 +235,7 @@ def test_two_answers_at_the_same_moment_are_in_any_order(flown: Path, tmp_path: 
     other = Writer((FIRST,), ahead_s=(0.0, 3.0, -5000.0))
     other.refused = {}
     other.robots(tmp_path)
-    assert examined(flown, tmp_path).trials
+    assert examined(flown, tmp_path).records
 
 
 class Page(HTMLParser):
@@ -311,7 +311,7 @@ def test_message_ages_are_corrected_and_losses_counted(found: Examined) -> None:
 def test_the_page_holds_everything(tmp_path: Path, found: Examined) -> None:
     html = write(found, tmp_path, (0.0, 5.0, 11.0), lambda *_: None).read_text()
     page = Page(html)
-    assert all(r.startswith(("data:image/png;base64,", "#trial-")) for r in page.references)
+    assert all(r.startswith(("data:image/png;base64,", "#mission-")) for r in page.references)
     assert not {"script", "link", "iframe", "b"} & set(page.tags)
     assert "url(" not in html and "@import" not in html
     for text in ("t1", "t2", "start <b>now</b>", "ann", "Repeatability", "r2"):
@@ -375,14 +375,14 @@ def test_without_a_world_there_is_no_cost(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bundle_id", [BUNDLE.id, "another"])
-def test_each_trial_has_the_sizes_of_its_own_policy(tmp_path: Path, bundle_id: str) -> None:
+def test_each_mission_has_the_sizes_of_its_own_policy(tmp_path: Path, bundle_id: str) -> None:
     Writer((FIRST,)).ground(tmp_path / "a")
-    (alone,) = examined(tmp_path).trials
+    (alone,) = examined(tmp_path).records
     other = Writer((SECOND,), nonce=99)
     other.bundle_id = bundle_id
     other.setup = {"world_size": 1024, "env_scale": 32.0, "sensor_size": 128}
     other.ground(tmp_path / "b")
-    first, second = examined(tmp_path).trials
+    first, second = examined(tmp_path).records
     assert first.cost.tolist() == alone.cost.tolist() and first.sensor_size == alone.sensor_size
     assert second.coverage is not None and second.coverage.importance.shape == (1024, 1024)
     assert second.sensor_size == 128
@@ -428,7 +428,7 @@ def test_logs_that_break_off_and_robots_that_are_missing(tmp_path: Path, flown: 
     assert missions == [("t1", (0, 1, 2)), ("t2", (0, 1, 2))]
     assert logs.programs_logged == {(1, 8), (2, 9)} and len(logs.received) == 2
     assert len([note for note in logs.notes if note.endswith("left out")]) == 2
-    found = examined(tmp_path, trials=("t1",))
+    found = examined(tmp_path, missions=("t1",))
     (values,) = found.summary()["trials"]
     assert values["robots"] == ["r0", "r1", "r2"]
     assert any("no log of r0 is here" in note for note in found.notes)
@@ -483,7 +483,7 @@ def test_restarts_and_alarms_are_told(tmp_path: Path) -> None:
     assert "battery <low>" in Page(page.read_text()).text
 
 
-def test_one_name_flown_twice_is_two_trials(tmp_path: Path) -> None:
+def test_one_name_flown_twice_is_two_missions(tmp_path: Path) -> None:
     again = dataclasses.replace(FIRST, begin_s=200.0)
     for folder, flight, nonce in (("a", FIRST, 10), ("b", again, 20)):
         Writer((flight,), nonce=nonce).robots(tmp_path / folder)
@@ -513,7 +513,7 @@ def one_landed(status: RobotStatus, at_s: float) -> RobotStatus:
 @pytest.mark.parametrize(
     ("change", "flights"), [(landed, 2), (reset_in_the_air, 2), (held, 1), (one_landed, 1)]
 )
-def test_a_trial_ends_when_all_have_landed_or_are_reset(
+def test_a_mission_ends_when_all_have_landed_or_are_reset(
     tmp_path: Path, change: Callable[[RobotStatus, float], RobotStatus], flights: int
 ) -> None:
     """As `lpac mission run` twice flies a script's trial: the robots' programs run on."""
@@ -536,7 +536,7 @@ def test_a_robot_that_does_not_know_where_it_is_counts_where_it_was(tmp_path: Pa
 
     writer.change = change
     writer.ground(tmp_path)
-    cost = examined(tmp_path).trials[0]
+    cost = examined(tmp_path).records[0]
     after_s = cost.cost_time_s
     expected = np.array([FIRST.cost(20.0 + at_s) for at_s in after_s])
     assert cost.cost[after_s < 6.0] == pytest.approx(expected[after_s < 6.0], rel=1e-3)
@@ -556,12 +556,12 @@ def test_without_any_position_for_seconds_the_cost_does_not_jump(tmp_path: Path)
 
     writer.change = change
     writer.ground(tmp_path)
-    trial = examined(tmp_path).trials[0]
-    assert len(trial.curve_time_s) == len(trial.cost_time_s)
-    after_s = trial.curve_time_s
+    record = examined(tmp_path).records[0]
+    assert len(record.curve_time_s) == len(record.cost_time_s)
+    after_s = record.curve_time_s
     # Robots 0 and 1 on their way, then where they were last.
     in_between = (after_s > 2.0) & (after_s < 7.0)
-    for at_s, cost in zip(after_s[in_between], trial.cost[in_between], strict=True):
+    for at_s, cost in zip(after_s[in_between], record.cost[in_between], strict=True):
         places_m = [FIRST.place_m(robot, 22.0 if robot < 2 else 20.0 + at_s) for robot in range(3)]
         assert cost == pytest.approx(
             coverage_cost(IMPORTANCE, np.array(places_m) * SCALE), rel=0.05
@@ -584,14 +584,14 @@ def test_nothing_of_a_figure_is_cut(tmp_path: Path) -> None:
     writer.change = change
     writer.ground(tmp_path)
     writer.robots(tmp_path)
-    [trial] = examined(tmp_path).trials
-    assert trial.messages is not None and trial.restarts
+    [record] = examined(tmp_path).records
+    assert record.messages is not None and record.restarts
     for figure in (
-        figures.states(trial), figures.start_and_end(trial), figures.overview(trial),
-        figures.costs([trial]), figures.snapshots(trial, (0.0, 3.0, 6.0, 10.0)),
-        figures.snapshots_and_costs({"a policy of some name": trial, "another": trial}),
-        figures.repeatability([trial, trial]), figures.messages(trial, trial.messages),
-        figures.loops(trial),
+        figures.states(record), figures.start_and_end(record), figures.overview(record),
+        figures.costs([record]), figures.snapshots(record, (0.0, 3.0, 6.0, 10.0)),
+        figures.snapshots_and_costs({"a policy of some name": record, "another": record}),
+        figures.repeatability([record, record]), figures.messages(record, record.messages),
+        figures.loops(record),
     ):  # fmt: skip
         save(figure, tmp_path / "figure")
         assert (tmp_path / "figure.pdf").read_bytes().startswith(b"%PDF")
@@ -690,7 +690,7 @@ def test_a_setup_of_another_version_is_understood(tmp_path: Path) -> None:
     writer = Writer((FIRST,))
     writer.setup = {"max_speed_m_s": 2.0}
     writer.ground(tmp_path)
-    assert examined(tmp_path).trials[0].cost[0] == pytest.approx(FIRST.cost(20.0))
+    assert examined(tmp_path).records[0].cost[0] == pytest.approx(FIRST.cost(20.0))
 
 
 def test_no_message_comes_before_it_was_sent(tmp_path: Path) -> None:
@@ -698,10 +698,10 @@ def test_no_message_comes_before_it_was_sent(tmp_path: Path) -> None:
     writer.age_s = -0.003
     writer.robots(tmp_path)
     writer.ground(tmp_path)
-    (trial,) = examined(tmp_path).trials
-    assert trial.messages is not None and trial.messages.age_quantile_s(0.5) == 0.0
-    assert np.nanmin(trial.messages.age_s) == 0.0
-    shown = page("", [Drawn(trial, {"messages": b""})], None, ())
+    (record,) = examined(tmp_path).records
+    assert record.messages is not None and record.messages.age_quantile_s(0.5) == 0.0
+    assert np.nanmin(record.messages.age_s) == 0.0
+    shown = page("", [Drawn(record, {"messages": b""})], None, ())
     assert "Clocks are corrected, to a few ms." in Page(shown).text
 
 
@@ -726,7 +726,7 @@ def test_mistakes_are_one_line(tmp_path: Path, flown: Path) -> None:
         with pytest.raises(ValueError, match=text):
             examined(*arguments)
     with pytest.raises(ValueError, match=r"--trial 't9': the logs have 't1', 't2'"):
-        examined(flown, trials=("t9",))
+        examined(flown, missions=("t9",))
     with pytest.raises(ValueError, match=r"--times -1: must be 0 or above"):
         Wanted(times_s=(-1.0,))
     with pytest.raises(OSError, match="nowhere"):

@@ -6,8 +6,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lpac.analysis import style
-from lpac.network.middleware import MIDDLEWARES
-from lpac.network.results import Run, Summary, left_out, summaries
+from lpac.middleware.kinds import MIDDLEWARES
+from lpac.middleware.results import Run, Summary, left_out, summaries
 
 _JITTER = 0.12
 

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from lpac.cli.main import app
 from lpac.extras import install_command
-from lpac.network.figures import of_restarts, over_robots
-from lpac.network.measure import Plan
-from lpac.network.middleware import MIDDLEWARES, NOTHING
-from lpac.network.results import (
+from lpac.middleware.figures import of_restarts, over_robots
+from lpac.middleware.kinds import MIDDLEWARES, NOTHING
+from lpac.middleware.measure import Plan
+from lpac.middleware.results import (
     CountedTime,
     Experiment,
     Reception,
@@ -122,7 +122,7 @@ def test_middlewares_take_turns() -> None:
         (1, 1, "zenoh"), (1, 1, NOTHING), (1, 2, "zenoh"), (1, 2, NOTHING), (2, 1, "zenoh"),
     ]  # fmt: skip
     # Who is alone has a stream, too.
-    assert plan.stations == 2
+    assert plan.places == 2
 
 
 def test_figures_have_a_panel_for_each_measure() -> None:
@@ -141,7 +141,7 @@ def without_cyclone(monkeypatch: pytest.MonkeyPatch) -> None:
             raise PackageNotFoundError(package)
         return "1.0"
 
-    monkeypatch.setattr("lpac.network.middleware.version", version)
+    monkeypatch.setattr("lpac.middleware.kinds.version", version)
 
 
 @pytest.mark.usefixtures("without_cyclone")

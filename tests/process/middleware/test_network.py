@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from lpac.network.measure import NetworkFleet
-from lpac.network.middleware import MIDDLEWARES, NOTHING
-from lpac.network.results import MEASURES
-from lpac.network.stations import LOOPBACK
+from lpac.middleware.kinds import MIDDLEWARES, NOTHING
+from lpac.middleware.measure import MiddlewareFleet
+from lpac.middleware.places import LOOPBACK
+from lpac.middleware.results import MEASURES
 from tests.command import called, error_line, lpac
 from tests.conftest import ROOT
 
@@ -36,7 +36,7 @@ INSTALLED = [
 
 @pytest.mark.parametrize("middleware", INSTALLED)
 def test_robots_hear_each_other_and_do_so_again_after_all_have_restarted(middleware: str) -> None:
-    with NetworkFleet([LOOPBACK] * 3) as fleet:
+    with MiddlewareFleet([LOOPBACK] * 3) as fleet:
         fleet.load(middleware)
         for start in (0, 1):
             fleet.start(middleware, 3, start)
@@ -54,7 +54,7 @@ def test_robots_hear_each_other_and_do_so_again_after_all_have_restarted(middlew
 
 
 def test_a_program_that_has_ended_by_itself_is_no_result() -> None:
-    with NetworkFleet([LOOPBACK] * 2) as fleet:
+    with MiddlewareFleet([LOOPBACK] * 2) as fleet:
         fleet.start("zenoh", 2, 0)
         patience_until_s = time.monotonic() + PATIENCE_S
         while not fleet.meet(2, 0):
@@ -73,7 +73,7 @@ def _robots_of(parent: int) -> list[int]:
     return [
         child
         for child in children
-        if b"lpac.network.robot" in Path(f"/proc/{child}/cmdline").read_bytes()
+        if b"lpac.middleware.robot" in Path(f"/proc/{child}/cmdline").read_bytes()
     ]
 
 

@@ -63,7 +63,7 @@ def _of_package(name: str) -> str | None:
 
 
 def _of_fast_dds() -> str | None:
-    told: str | None = importlib.import_module("lpac.network.over_fastdds").version()
+    told: str | None = importlib.import_module("lpac.middleware.over_fastdds").version()
     return told
 
 
@@ -71,14 +71,17 @@ _BENCH = install_command("bench")
 MIDDLEWARES: Mapping[str, Middleware] = MappingProxyType(
     {
         "zenoh": Middleware(
-            "zenoh", "lpac.network.over_zenoh", _BENCH, partial(_of_package, "eclipse-zenoh")
+            "zenoh", "lpac.middleware.over_zenoh", _BENCH, partial(_of_package, "eclipse-zenoh")
         ),
         "cyclonedds": Middleware(
-            "Cyclone DDS", "lpac.network.over_cyclone", _BENCH, partial(_of_package, "cyclonedds")
+            "Cyclone DDS",
+            "lpac.middleware.over_cyclone",
+            _BENCH,
+            partial(_of_package, "cyclonedds"),
         ),
         "fastdds": Middleware(
             "Fast DDS",
-            "lpac.network.over_fastdds",
+            "lpac.middleware.over_fastdds",
             "sudo apt install g++ libfastrtps-dev",
             _of_fast_dds,
             is_optional=True,

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from edge.core import F64
+from edge.core.schema import Bounded, NonNegative, Share
 from edge.messages.topics import ReceiveCallback, Topic
 from lpac.sim.schedule import Schedule
 
@@ -17,7 +18,7 @@ GROUND = -1
 
 
 @dataclass(frozen=True, slots=True)
-class Air:
+class Air(Bounded):
     """What becomes of messages. Any of it may be replaced while it is used.
 
     From one sender to one receiver a message is lost with probability `loss`, arrives twice with
@@ -30,21 +31,16 @@ class Air:
     Raises ValueError that names an impossible value.
     """
 
-    loss: float = 0.0
-    duplication: float = 0.0
-    corruption: float = 0.0
-    delay_s: float = 0.01
+    loss: Share = 0.0
+    duplication: Share = 0.0
+    corruption: Share = 0.0
+    delay_s: NonNegative = 0.01
     range_m: float = math.inf
     partition: tuple[frozenset[int], ...] = ()
     silent: frozenset[int] = frozenset()
     deaf: frozenset[int] = frozenset()
 
-    def __post_init__(self) -> None:
-        for name in ("loss", "duplication", "corruption"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be from 0 to 1")
-        if not 0.0 <= self.delay_s < math.inf:
-            raise ValueError(f"delay_s = {self.delay_s}: must be at least 0 and finite")
+    def check_rules(self) -> None:
         if not self.range_m > 0.0:
             raise ValueError(f"range_m = {self.range_m}: must be above 0")
 

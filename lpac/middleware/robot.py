@@ -1,4 +1,4 @@
-"""`python -m lpac.network.robot INDEX ENDPOINT...`: a robot's program, as far as the radio goes.
+"""`python -m lpac.middleware.robot INDEX ENDPOINT...`: a robot's program, as far as the radio goes.
 
 It says a message as large, and as often, as a robot does, and tells what it hears. Each start is a
 process of its own, forked from this one, so that it has its middleware at once: seconds of imports
@@ -26,7 +26,7 @@ from collections.abc import Sequence
 
 from edge.drivers.stop import Stop
 from edge.messages.topics import MESSAGE
-from lpac.network.middleware import MIDDLEWARES
+from lpac.middleware.kinds import MIDDLEWARES
 from lpac.radio.airtime import MESSAGE_BYTES
 
 SIZE_BYTES = round(MESSAGE_BYTES["float16"])

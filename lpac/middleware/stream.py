@@ -1,4 +1,4 @@
-"""`python -m lpac.network.stream receive ADDRESS`, or `send ADDRESS PORT`: what TCP carries.
+"""`python -m lpac.middleware.stream receive ADDRESS`, or `send ADDRESS PORT`: what TCP carries.
 
 The receiver says `listening PORT`. It answers each line on its standard input with
 `received BYTES AT`: all so far, and the time in ns of this machine's monotonic clock. Both end with

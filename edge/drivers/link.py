@@ -7,7 +7,7 @@ from edge.identity.group import TOPICS_OF_GROUP
 from edge.messages.topics import LinkSetting
 
 
-def zenoh_radio(setting: LinkSetting) -> ZenohLink | MulticastLink:
+def zenoh_link(setting: LinkSetting) -> ZenohLink | MulticastLink:
     """The type "zenoh" of robot.toml's [link], a context manager; it has no options.
 
     Raises LinkError or ConfigError.

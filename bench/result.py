@@ -40,7 +40,7 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class Result:
     """One bench's result: `figures` for the file, tables for people, and both in `targets`."""
 
     name: str

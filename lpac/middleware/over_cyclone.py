@@ -27,7 +27,7 @@ from cyclonedds.util import duration
 
 from edge.core.address import is_loopback
 from edge.messages.topics import MESSAGE, TOPICS
-from lpac.network.middleware import Peer
+from lpac.middleware.kinds import Peer
 
 # Below the ports that `lpac.sim.ports` gives; each process's are of a block of its own, and so the
 # fleets of two that measure at once on one loopback do not find each other.

@@ -18,7 +18,7 @@ from threading import Event, Thread
 from typing import Self
 
 from edge.messages.topics import MESSAGE, TOPICS
-from lpac.network.middleware import Peer
+from lpac.middleware.kinds import Peer
 
 _SOURCE = Path(__file__).with_name("fast_dds.cpp")
 # As Cyclone DDS's (`over_cyclone`): one measurement has them one after another.

@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from edge.messages.mission import RadioCounts
 from lpac.analysis.snapshot import FleetSnapshot
 from lpac.cli.main import app
-from lpac.fleet.radio import in_the_wifi, reading
+from lpac.fleet.wifi import in_the_wifi, reading
 from lpac.radio.checked import WifiReading
 from tests.unit.cli.test_fleet import write_fleet
 from tests.unit.ground import snapshots

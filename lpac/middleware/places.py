@@ -18,7 +18,7 @@ _ENDS_WITHIN_S = 30.0
 _LOOK_AGAIN_S = 0.2
 
 
-class NetworkStation(NamedTuple):
+class NetworkPlace(NamedTuple):
     """A robot's place in the network; `namespace` None is this machine's own."""
 
     address: str
@@ -31,10 +31,10 @@ class NetworkStation(NamedTuple):
         return ["ip", "netns", "exec", self.namespace, *command]
 
 
-LOOPBACK = NetworkStation("127.0.0.1")
+LOOPBACK = NetworkPlace("127.0.0.1")
 
 
-def station_in(namespace: str) -> NetworkStation:
+def place_in(namespace: str) -> NetworkPlace:
     """At the namespace's first address. Raises ValueError, OSError."""
     if os.geteuid() != 0:
         raise ValueError("--namespaces: only root runs programs in network namespaces: use sudo")
@@ -46,7 +46,7 @@ def station_in(namespace: str) -> NetworkStation:
     told = subprocess.run(asked, check=False, capture_output=True, text=True)
     for interface in json.loads(told.stdout or "[]"):
         for address in interface.get("addr_info", ()):
-            return NetworkStation(address["local"], namespace)
+            return NetworkPlace(address["local"], namespace)
     raise ValueError(
         f"--namespaces: {namespace} has no IPv4 address but its loopback's: `ip -n {namespace} "
         "address` shows all"
@@ -77,13 +77,13 @@ class News:
 
 
 class Program:
-    """A module of this package that runs as a process at a station. A context, which ends it.
+    """A module of this package that runs as a process at a place. A context, which ends it.
 
     It ends with this process, too, however that ends: its standard input does.
     """
 
     def __init__(
-        self, station: NetworkStation, news: News, hear: Callable[[str], None], *command: str
+        self, place: NetworkPlace, news: News, hear: Callable[[str], None], *command: str
     ) -> None:
         """`command` is the module and its arguments; `hear` gets its lines, from a thread."""
         self._command = command
@@ -93,7 +93,7 @@ class Program:
         self._leaving = False
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the program runs
         self._process = subprocess.Popen(
-            station.enter(python_program(*command)),
+            place.enter(python_program(*command)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,

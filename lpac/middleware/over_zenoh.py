@@ -6,7 +6,7 @@ from typing import Self
 
 from edge.drivers.zenoh_link import ZenohLink
 from edge.messages.topics import MESSAGE
-from lpac.network.middleware import Peer
+from lpac.middleware.kinds import Peer
 
 
 class _ZenohPeer:

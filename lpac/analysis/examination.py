@@ -1,4 +1,4 @@
-"""What is in flight logs: the trials, and what a reader should know of these."""
+"""What is in flight logs: a record of each mission, and what a reader should know of these."""
 
 import contextlib
 import json
@@ -14,7 +14,7 @@ from edge.policy.bundle import Bundle, BundleError, load_bundle
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, Separation
 from lpac.analysis.logs import Logs, Progress, configured_fence, read_logs
-from lpac.analysis.trials import Mission, find_missions, record_of
+from lpac.analysis.missions import Mission, find_missions, record_of
 
 _MOST_NOTES = 3  # in one line
 
@@ -43,12 +43,12 @@ class _Sizes(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """What the report is to be of: only the missions called `trials` (none: all), snapshots at
+    """What the report is to be of: only the missions called `missions` (none: all), snapshots at
     `times_s` (none: at the begin, a quarter, half and all of each), over the world in `world`, for
     the policy in `bundle`. `world_option` is what its reader gives the world by.
     """
 
-    trials: tuple[str, ...] = ()
+    missions: tuple[str, ...] = ()
     times_s: tuple[float, ...] = ()
     world: Path | None = None
     bundle: Path | None = None
@@ -61,14 +61,14 @@ class Wanted:
 
 
 class Examined(NamedTuple):
-    """The trials in some logs, and what a reader should know of these."""
+    """The missions in some logs as records, and what a reader should know of these."""
 
-    trials: tuple[FlightRecord, ...]
+    records: tuple[FlightRecord, ...]
     notes: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
         """What is to be said of them, as JSON values."""
-        return {"trials": [_values(trial) for trial in self.trials], "notes": list(self.notes)}
+        return {"trials": [_values(record) for record in self.records], "notes": list(self.notes)}
 
 
 _EVERYTHING = Wanted()
@@ -91,16 +91,16 @@ def examine(
     notes = list(logs.notes)
     worlds = _Worlds(logs, paths, wanted, notes)
     fences = {m.robot_id: configured_fence(m) for m in logs.metadata}
-    trials = []
+    records = []
     for index, mission in enumerate(chosen):
         progress(f"examining {mission.name}", index / len(chosen))
-        trial = record_of(
+        record = record_of(
             logs, mission, [other for other in missions if other is not mission],
             *worlds.of(mission), fences.get(mission.robots[0]),
         )  # fmt: skip
-        notes += _notes(logs, trial, wanted)
-        trials.append(trial)
-    return Examined(tuple(trials), tuple(notes))
+        notes += _notes(logs, record, wanted)
+        records.append(record)
+    return Examined(tuple(records), tuple(notes))
 
 
 def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission]:
@@ -113,13 +113,13 @@ def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission
         raise ValueError(
             f"no mission was flown in these logs, of {counted(robots, 'robot')}{left_out}"
         )
-    if not wanted.trials:
+    if not wanted.missions:
         return missions
     names = [mission.name for mission in missions]
-    for name in wanted.trials:
+    for name in wanted.missions:
         if name not in names:
             raise ValueError(f"--trial {name!r}: the logs have {', '.join(map(repr, names))}")
-    return [mission for mission in missions if mission.name in wanted.trials]
+    return [mission for mission in missions if mission.name in wanted.missions]
 
 
 class _Worlds:
@@ -233,67 +233,68 @@ def _policy(configuration: str) -> dict[str, Any]:
     return policy if isinstance(policy, dict) else {}
 
 
-def _notes(logs: Logs, trial: FlightRecord, wanted: Wanted) -> Iterable[str]:
-    late_s = [f"{time_s:g}" for time_s in wanted.times_s if time_s > trial.duration_s]
+def _notes(logs: Logs, record: FlightRecord, wanted: Wanted) -> Iterable[str]:
+    late_s = [f"{time_s:g}" for time_s in wanted.times_s if time_s > record.duration_s]
     if late_s:
-        yield f"{trial.name}: lasted {trial.duration_s:.1f} s: no snapshot at {', '.join(late_s)} s"
-    if len(trial.cost) and not len(trial.normalized):
-        yield f"{trial.name}: the world holds no importance: no normalised cost"
+        lasted = f"lasted {record.duration_s:.1f} s"
+        yield f"{record.name}: {lasted}: no snapshot at {', '.join(late_s)} s"
+    if len(record.cost) and not len(record.normalized):
+        yield f"{record.name}: the world holds no importance: no normalised cost"
     silent = [
         robot.name
-        for robot in trial.robots
+        for robot in record.robots
         if not {(robot.robot_id, said.boot_nonce) for said in robot.said} & logs.programs_logged
     ]
     if silent:
-        whose = "any robot" if len(silent) == len(trial.robots) else ", ".join(silent)
+        whose = "any robot" if len(silent) == len(record.robots) else ", ".join(silent)
         yield (
-            f"{trial.name}: no log of {whose} is here, only what the ground heard: which messages "
+            f"{record.name}: no log of {whose} is here, only what the ground heard: which messages "
             "arrived there is not known"
         )
-    told = trial.messages
-    if told is not None and not trial.clocks_known and len(told.heard_age_s):
+    told = record.messages
+    if told is not None and not record.clocks_known and len(told.heard_age_s):
         low_s, high_s = told.age_quantile_s(0.0), told.age_quantile_s(0.5)
         if low_s < -0.05 or high_s > 2.0:
             yield (
-                f"{trial.name}: the robots' clocks differ, and no ground log tells by how much: "
+                f"{record.name}: the robots' clocks differ, and no ground log tells by how much: "
                 "message ages, and times between robots, are wrong"
             )
 
 
-def _values(trial: FlightRecord) -> dict[str, Any]:
-    """What is to be said of a trial, as JSON values."""
-    told = trial.messages
+def _values(record: FlightRecord) -> dict[str, Any]:
+    """What is to be said of a mission, as JSON values."""
+    told = record.messages
     return {
-        "trial": trial.name,
-        "began_unix_s": round(trial.begin_s, 3),
-        "duration_s": round(trial.duration_s, 3),
-        "robots": [robot.name for robot in trial.robots],
-        "worlds": list(trial.world_ids),
+        "trial": record.name,
+        "began_unix_s": round(record.begin_s, 3),
+        "duration_s": round(record.duration_s, 3),
+        "robots": [robot.name for robot in record.robots],
+        "worlds": list(record.world_ids),
         "cost": {
-            "initial": _first(trial.cost, 0),
-            "final": _first(trial.cost, -1),
-            "normalized": _first(trial.normalized, -1),
-            "lloyd": _number(trial.lloyd),
-            "normalized_lloyd": _number(trial.normalized_lloyd),
-            "time_s": trial.curve_time_s[: len(trial.normalized)].round(3).tolist(),
-            "curve": trial.normalized.round(6).tolist(),
+            "initial": _first(record.cost, 0),
+            "final": _first(record.cost, -1),
+            "normalized": _first(record.normalized, -1),
+            "lloyd": _number(record.lloyd),
+            "normalized_lloyd": _number(record.normalized_lloyd),
+            "time_s": record.curve_time_s[: len(record.normalized)].round(3).tolist(),
+            "curve": record.normalized.round(6).tolist(),
         },
-        "separation": _apart(trial.separation),
-        "fence_margin_m": _number(trial.fence_margin_m),
+        "separation": _apart(record.separation),
+        "fence_margin_m": _number(record.fence_margin_m),
         "truth": {
             "cost": {
-                "initial": _first(trial.true_cost, 0),
-                "final": _first(trial.true_cost, -1),
-                "normalized": _first(trial.normalized_true, -1),
+                "initial": _first(record.true_cost, 0),
+                "final": _first(record.true_cost, -1),
+                "normalized": _first(record.normalized_true, -1),
             },
-            "separation": _apart(trial.true_separation),
-            "fence_margin_m": _number(trial.true_fence_margin_m),
+            "separation": _apart(record.true_separation),
+            "fence_margin_m": _number(record.true_fence_margin_m),
         }
-        if trial.truth
+        if record.truth
         else None,
-        "restarts": dict(trial.restarts),
-        "alarms": [alarm._asdict() for alarm in trial.alarms],
-        "commands": [command._asdict() for command in trial.commands],
+        "restarts": dict(record.restarts),
+        "alarms": [alarm._asdict() for alarm in record.alarms],
+        "commands": [command._asdict() for command in record.commands],
         "messages": None
         if told is None
         else {
@@ -303,7 +304,7 @@ def _values(trial: FlightRecord) -> dict[str, Any]:
             "loss_share": _number(told.loss_share),
             "age_p50_s": _number(told.age_quantile_s(0.5)),
             "age_p99_s": _number(told.age_quantile_s(0.99)),
-            "ages_corrected": trial.clocks_known,
+            "ages_corrected": record.clocks_known,
         },
         "loops": {
             loop: {
@@ -312,11 +313,11 @@ def _values(trial: FlightRecord) -> dict[str, Any]:
                 "overruns": sum(late.overruns for late in robots.values()),
                 "failures": sum(late.failures for late in robots.values()),
             }
-            for loop, robots in trial.lateness.items()
+            for loop, robots in record.lateness.items()
             if robots
         },
-        "start_m": trial.places_at(0.0),
-        "end_m": trial.places_at(trial.duration_s),
+        "start_m": record.places_at(0.0),
+        "end_m": record.places_at(record.duration_s),
     }
 
 

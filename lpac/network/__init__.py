@@ -1,8 +1,0 @@
-"""The paper's experiments on the network: throughput while programs restart, and over robots.
-
-What speaks and what is measured are programs of their own, as on robots: at each station one that
-is a robot (`robot`) and, at two of them, the ends of a bulk stream (`stream`). `stations` starts
-them, on this machine's loopback or in network namespaces, and `measure` makes the runs. A
-middleware is an adapter of two calls (`middleware`, `over_zenoh`, `over_cyclone`). What runs came
-to is pure (`results`).
-"""
