@@ -1,19 +1,13 @@
 """Robots in flight on this machine: how late their loops are, and what their programs take.
 
-Ten robots, without keys and with them, and one beside busy processes. The processes are those of a
-fleet: each robot's with its radio, autopilot and flight log; its watchdog, a process of its own, is
-not counted.
+Ten robots, without keys and with them. The processes are those of a fleet: each robot's with its
+radio, autopilot and flight log; its watchdog, a process of its own, is not counted.
 """
 
 import math
-import os
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from operator import attrgetter
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -28,6 +22,7 @@ from lpac.sim.fleet.processes import Fleet
 from lpac.sim.scenario import Scenario
 
 LOOPS = ("perception", "policy", "control")
+PLAIN, WITH_KEYS = "without keys", "with keys"
 
 # Once the mission has begun, all has been loaded that a flight needs.
 _SETTLED_S = 3.0
@@ -54,84 +49,70 @@ class _Flight(NamedTuple):
     statuses: list[LoggedStatus]
     taken: list[_Taken]
 
+    def of(self, loop: str) -> list[LoopStatus]:
+        """Each robot's."""
+        return [status.loops[loop] for status in self.statuses]
 
-def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = True) -> Result:
-    """A flight of so many robots; and with `beside_busy` one of a single robot."""
-    progress(f"loops: {robots} robots fly, about two minutes")
-    crowd = _fly(robots, mission_s)
-    progress(f"loops: {robots} robots with keys fly, about two minutes")
-    with_keys = _fly(robots, mission_s, secure=True)
-    flights = {
-        f"{robots} robots": crowd.statuses,
-        f"{robots} robots with keys": with_keys.statuses,
-    }
-    if beside_busy:
-        progress("loops: one robot flies beside busy processes, about two minutes")
-        with _busy():
-            flights["1 robot, every core busy"] = _fly(1, mission_s).statuses
-    rows = []
-    figures: dict[str, Any] = {}
-    for name, statuses in flights.items():
-        for loop in LOOPS:
-            of_all = [status.loops[loop] for status in statuses]
-            figures.setdefault(name, {})[loop] = _summary(of_all)
-            rows.append((name, loop, *_cells(of_all)))
-    figures["taken"] = [each._asdict() for each in crowd.taken]
-    figures["taken_with_keys"] = [each._asdict() for each in with_keys.taken]
-    cpu, private = (
-        {
-            name: median(what(each) for each in flight.taken)
-            for name, flight in (("plain", crowd), ("with keys", with_keys))
-        }
-        for what in (attrgetter("all_cpu_percent"), attrgetter("private_mb"))
+
+def measure(robots: int = 10, mission_s: float = 60.0) -> Result:
+    """Two flights of so many robots."""
+    flights: dict[str, _Flight] = {}
+    for keys in (PLAIN, WITH_KEYS):
+        progress(f"loops: {robots} robots fly {keys}, about two minutes")
+        flights[keys] = _fly(robots, mission_s, secure=keys == WITH_KEYS)
+    plain, with_keys = (
+        (
+            median(each.all_cpu_percent for each in flight.taken),
+            median(each.private_mb for each in flight.taken),
+        )
+        for flight in flights.values()
     )
-    medians = {
-        "processor, % of a core": (cpu["plain"], 4.0),
-        "threads": (median(each.threads for each in crowd.taken), 40.0),
-        "private memory, MB": (private["plain"], 45.0),
-        "processor, % of a core, that keys cost": (cpu["with keys"] - cpu["plain"], 1.0),
-        "private memory, MB, that keys cost": (private["with keys"] - private["plain"], 8.0),
-    }
+    taken = flights[PLAIN].taken
+    late_ms = max(each.loops["control"].lateness_max_ms for each in flights[PLAIN].statuses)
     return Result(
         "loops",
-        figures,
+        {
+            keys: {
+                "lateness": {loop: _summary(flight.of(loop)) for loop in LOOPS},
+                "taken": [each._asdict() for each in flight.taken],
+            }
+            for keys, flight in flights.items()
+        },
         [
             Table(
-                "Lateness of the loops, ms: the median robot, and the worst",
+                f"Lateness of {robots} robots' loops, ms: the median robot, and the worst",
                 ("", "loop", "p50", "p99", "max", "ticks left out"),
-                rows,
-            ),
-            Table(
-                f"What each of {robots} robots' programs takes in flight: the median, the most",
-                ("", "median", "most"),
-                _taken_rows(crowd.taken),
-            ),
-            Table(
-                "The same with keys: messages signed, and TLS",
-                ("", "median", "most"),
-                _taken_rows(with_keys.taken),
-            ),
-        ],
-        [
-            Target(
-                "worst lateness of a control tick over the watchdog's 0.5 s",
-                max(status.loops["control"].lateness_max_ms for status in crowd.statuses) / 500.0,
-                1.0,
-                False,
+                [
+                    (keys, loop, *_cells(flight.of(loop)))
+                    for keys, flight in flights.items()
+                    for loop in LOOPS
+                ],
             ),
             *(
-                Target(f"{what} of a robot", figure, limit, at_least=False)
-                for what, (figure, limit) in medians.items()
+                Table(
+                    f"What each of {robots} robots' programs takes in flight, {keys}",
+                    ("", "median", "most"),
+                    _taken_rows(flight.taken),
+                )
+                for keys, flight in flights.items()
             ),
         ],
         [
-            "Over the last minute of the mission. The vehicles and the operator share the cores; "
-            "a busy process runs Python without a pause, at the same priority."
+            Target(what, measured, limit, at_least=False)
+            for what, measured, limit in (
+                ("worst lateness of a control tick over the watchdog's 0.5 s", late_ms / 500.0, 1),
+                ("processor, % of a core of a robot", plain[0], 4),
+                ("threads of a robot", median(each.threads for each in taken), 40),
+                ("private memory of a robot, MB", plain[1], 45),
+                ("processor, % of a core, that keys cost", with_keys[0] - plain[0], 1),
+                ("private memory, MB, that keys cost", with_keys[1] - plain[1], 8),
+            )
         ],
+        ["Over the last minute of the mission. The vehicles and the operator share the cores."],
     )
 
 
-def _fly(robots: int, mission_s: float, *, secure: bool = False) -> _Flight:
+def _fly(robots: int, mission_s: float, *, secure: bool) -> _Flight:
     looks: list[tuple[float, list[Usage]]] = []
     began_s = looked_s = -math.inf
 
@@ -180,19 +161,6 @@ def _taken_rows(taken: Sequence[_Taken]) -> list[tuple[str, ...]]:
     return [
         (name, f"{median(numbers):.2f}", f"{max(numbers):.2f}") for name, numbers in columns.items()
     ]
-
-
-@contextmanager
-def _busy() -> Iterator[None]:
-    """A process without a pause on each core."""
-    command = [sys.executable, "-c", "while True: pass"]
-    processes = [subprocess.Popen(command) for _ in range(os.cpu_count() or 1)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
 
 
 def _summary(loops: Sequence[LoopStatus]) -> dict[str, Any]:

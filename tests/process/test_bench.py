@@ -19,11 +19,11 @@ def test_footprint(tmp_path: Path) -> None:
 
 @pytest.mark.real_time
 def test_loops(tmp_path: Path) -> None:
-    result = kept(loops.measure(robots=1, mission_s=6.0, beside_busy=False), tmp_path)
+    result = kept(loops.measure(robots=1, mission_s=6.0), tmp_path)
     check_frame(result, "loops", targets=6)
-    (taken,) = result["figures"]["taken"]
+    (taken,) = result["figures"][loops.PLAIN]["taken"]
     assert set(loops.LOOPS) | {"preflight", "status", "log", "rx"} <= taken["cpu_percent"].keys()
-    assert len(result["figures"]["taken_with_keys"]) == 1
+    assert len(result["figures"][loops.WITH_KEYS]["taken"]) == 1
     assert taken["threads"] > 8 and 10.0 < taken["private_mb"] < taken["resident_mb"]
 
 
