@@ -288,7 +288,7 @@ def _not_of(kind: Any, value: object) -> str:
             and field.default is dataclasses.MISSING
             and field.default_factory is dataclasses.MISSING
         )
-        return f": {next(missing)} is missing"
+        return f": {next(missing, 'a key')} is missing"
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if isinstance(kind, type) and issubclass(kind, StrEnum):
         origin, arguments = Literal, tuple(map(str, kind))

@@ -57,6 +57,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from edge.core.logger import log
+from edge.core.schema import AtLeastOne, require
 from edge.core.vehicle import VehicleState
 from edge.messages.mission import GroundState, Order, OrderResult, RobotStatus
 
@@ -172,8 +173,7 @@ class FlightLog:
                 f"max_total_bytes = {max_total_bytes}: must be at least "
                 f"max_segment_bytes = {max_segment_bytes}"
             )
-        if max_queued_messages < 1:
-            raise ValueError(f"max_queued_messages = {max_queued_messages}: must be at least 1")
+        require(AtLeastOne, max_queued_messages, "max_queued_messages")
         self._directory = directory
         self._metadata = metadata
         self._topics = ROBOT_TOPICS if topics is None else topics

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from edge.core import F64
+from edge.core.schema import NonNegative, Share, require
 
 
 class Medium:
@@ -20,10 +21,8 @@ class Medium:
         """
         if not range_m > 0.0:
             raise ValueError(f"range_m = {range_m}: must be positive")
-        if not 0.0 <= loss <= 1.0:
-            raise ValueError(f"loss = {loss}: must be from 0 to 1")
-        if not 0.0 <= delay_s < np.inf:
-            raise ValueError(f"delay_s = {delay_s}: must be at least 0 and finite")
+        require(Share, loss, "loss")
+        require(NonNegative, delay_s, "delay_s")
         self._range_m = range_m
         self._loss = loss
         self._delay_s = delay_s

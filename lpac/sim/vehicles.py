@@ -6,6 +6,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.ports import Odometry
+from edge.core.schema import NonNegative, require
 
 
 class PointVehicles:
@@ -21,8 +22,7 @@ class PointVehicles:
         `lag_s` is the time constant of the first order with which a vehicle's velocity follows the
         one that it is told; 0: at once. Raises ValueError if it is not finite and at least 0.
         """
-        if not 0.0 <= lag_s < math.inf:
-            raise ValueError(f"lag_s = {lag_s}: must be at least 0 and finite")
+        require(NonNegative, lag_s, "lag_s")
         # (2, N) each, so that what is computed of all runs along the memory.
         self._start_m = np.ascontiguousarray(positions_m.T)
         self._velocity_m_s = np.zeros_like(self._start_m)

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from msgspec import inspect
 
 from edge.core.fence import Fence
@@ -218,6 +220,32 @@ def test_what_is_asked_of_one_robot_overrides_what_is_asked_of_all() -> None:
     assert [state.safety_action_for(robot) for robot in (2, 3, 4)] == ["hold", "land", "none"]
     state = GroundState(7, "anna", enabled=True, robot_enabled={"3": False, "4": True})
     assert [state.enabled_for(robot) for robot in (2, 3, 4)] == [True, False, True]
+
+
+JSON_VALUES: st.SearchStrategy[Any] = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner),
+    max_leaves=4,
+)
+
+
+@given(message=st.sampled_from([STATE, ORDER, STATUS]), data=st.data())
+def test_whatever_a_field_holds_is_taken_or_refused_in_one_line(
+    message: GroundState | Order | RobotStatus, data: st.DataObject
+) -> None:
+    told: Any = json.loads(encode(message))
+    within = told
+    while True:
+        key = data.draw(st.sampled_from(sorted(within)))
+        if not (isinstance(within[key], dict) and within[key] and data.draw(st.booleans())):
+            break
+        within = within[key]
+    within[key] = data.draw(JSON_VALUES)
+    try:
+        decode(type(message), json.dumps(told).encode())
+    except MessageError as error:
+        assert str(error).startswith(f"{type(message).__name__}: ")
+        assert "\n" not in str(error)
 
 
 def test_what_was_explored_survives_the_way() -> None:
