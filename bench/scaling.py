@@ -4,7 +4,8 @@ import gc
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from multiprocessing import get_context
 from time import perf_counter, process_time
@@ -114,9 +115,9 @@ def _targets(figures: dict[str, dict[str, Any]]) -> Iterator[Target]:
 
 def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dict[str, float]:
     bundle = load_bundle(BUNDLE)
-    fly = _FLY[name]
     # What the libraries allocate once is not the robots'.
-    fly(Scenario(robots=2, duration_s=1.0, random_feature_count=1), world_for(bundle, 2), _no_note)
+    small = Scenario(robots=2, duration_s=1.0, random_feature_count=1)
+    _fly(name, small, world_for(bundle, 2), lambda _: None)
     gc.freeze()  # as `lpac sim` does
     empty_mb = usage(os.getpid()).resident_mb
     flying_mb = wall_s = cpu_s = 0.0
@@ -134,7 +135,7 @@ def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dic
         robots=robots, seed=seed, duration_s=duration_s, random_feature_count=robots
     )
     larger = world_for(bundle, robots)
-    cost_s = fly(scenario, larger, note)
+    cost_s = _fly(name, scenario, larger, note)
     assert larger.manifest.perception
     return {
         "robots": robots,
@@ -147,32 +148,18 @@ def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dic
     }
 
 
-def _no_note(time_s: float) -> None:
-    """Nobody looks."""
-
-
-def _fly_exactly(scenario: Scenario, bundle: Bundle, note: Note) -> float:
+def _fly(name: str, scenario: Scenario, bundle: Bundle, note: Note) -> float:
     """Fly; returns what J once a second takes, s, which is not part of the noted time."""
-    flight = fly_exactly(scenario, bundle, lambda moment: note(moment.time_s))
-    return _cost_s(scenario, flight.importance, flight.positions_m)
-
-
-def _fly_batched(scenario: Scenario, bundle: Bundle, note: Note) -> float:
-    return _fly_on(None, scenario, bundle, note)
-
-
-def _fly_on_two_threads(scenario: Scenario, bundle: Bundle, note: Note) -> float:
-    with ThreadPoolExecutor(1) as executor:
-        return _fly_on(executor, scenario, bundle, note)
-
-
-def _fly_on(executor: Executor | None, scenario: Scenario, bundle: Bundle, note: Note) -> float:
-    flights = BatchedFlights([scenario], bundle, executor)
-    [prepared] = flights.prepared
-    positions_m = []
-    for [moment] in flights.moments(prepared.times_s):
-        positions_m.append(moment.positions_m)
-        note(moment.time_s)
+    if name == EXACT:
+        flight = fly_exactly(scenario, bundle, lambda moment: note(moment.time_s))
+        return _cost_s(scenario, flight.importance, flight.positions_m)
+    with ThreadPoolExecutor(1) if name == TWO_THREADS else nullcontext() as executor:
+        flights = BatchedFlights([scenario], bundle, executor)
+        [prepared] = flights.prepared
+        positions_m = []
+        for [moment] in flights.moments(prepared.times_s):
+            positions_m.append(moment.positions_m)
+            note(moment.time_s)
     return _cost_s(scenario, prepared.importance, positions_m)
 
 
@@ -181,10 +168,3 @@ def _cost_s(scenario: Scenario, importance: F32, positions_m: Sequence[F64] | F6
     for each_m in positions_m[SAMPLES_PER_COST::SAMPLES_PER_COST]:
         coverage_cost(importance, scenario.scale.position_to_model(each_m))
     return perf_counter() - start_s
-
-
-_FLY = {
-    EXACT: _fly_exactly,
-    BATCHED: _fly_batched,
-    TWO_THREADS: _fly_on_two_threads,
-}
