@@ -15,11 +15,13 @@ from edge.policy.lpac.manifest import LpacManifest
 from edge.robot.config import RobotConfig
 from export.parameters import PolicyParameters
 from handbook.markdown import cell, code, table
-from lpac.ablate.config import AblationConfig, FlownAs
+from lpac.ablate.config import AblationConfig
 from lpac.fleet.settings import FleetTable, RobotTable
 from lpac.ground.script import STEPS, STEPS_BEFORE, ScriptTable
 from lpac.ground.site import SavedSite
 from lpac.radio.airtime import Wifi
+from lpac.sim.scenario import Scenario
+from lpac.study.file import ConditionKeys, StudyFile
 from lpac.train.config import TrainingConfig
 from lpac.train.lpac import LpacNetwork
 
@@ -30,7 +32,8 @@ ROBOT = (RobotConfig,)
 FLEET = (FleetTable, RobotTable)
 GROUND = (ScriptTable, *STEPS_BEFORE.values(), *STEPS.values(), SavedSite, Wifi)
 TRAINING = (TrainingConfig, LpacNetwork, PolicyParameters)
-ABLATION = (AblationConfig, FlownAs)
+ABLATION = (AblationConfig,)
+STUDY = (StudyFile, ConditionKeys, Scenario)
 MANIFEST = (Manifest, LpacManifest)
 
 
@@ -103,10 +106,26 @@ def ablation() -> str:
     return _page(
         "Ablation",
         "What `lpac ablate ABLATION.toml` reads. `train` holds keys of "
-        "[a training](training.md) that are merged into the base.",
+        "[a training](training.md) that are merged into the base, `fly` those of "
+        "[a study's condition](study.md).",
         _example("examples/ablation.toml"),
         *_tables(AblationConfig, ""),
-        *_tables(FlownAs, "fly"),
+    )
+
+
+def study() -> str:
+    """What `lpac study` reads."""
+    return _page(
+        "A study",
+        "What `lpac study STUDY.toml` reads; `lpac/paper/studies` has the paper's experiments in "
+        "the same form.",
+        _example("examples/study.toml"),
+        *_tables(StudyFile, ""),
+        "## Keys of `[scenario]` and of each of `[[conditions]]`",
+        *_tables(ConditionKeys, "", "Of the condition"),
+        *_tables(Scenario, "", "Of its flights"),
+        "`controller`, `seed`, `features` and `scale` follow from the study: a file does not have "
+        "them.",
     )
 
 

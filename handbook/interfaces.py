@@ -47,7 +47,7 @@ _INTERFACES = {
         "lpac.train.config": "DataConfig",
         "lpac.sim.experiment": "prepare Preparation",
         "lpac.sim.baselines": "BaselineName",
-        "lpac.evaluate.flights": "fly_group FlightGroup EvaluationFlight FlownCost",
+        "lpac.study.flights": "records_of FlightGroup PlannedFlight CostCurve",
     },
     "A vehicle": {
         "edge.core.ports": (

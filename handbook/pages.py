@@ -22,6 +22,7 @@ _GENERATED: dict[str, Callable[[], str]] = {
     "docs/reference/fleet-toml.md": configuration.fleet,
     "docs/reference/ground-files.md": configuration.ground,
     "docs/reference/training.md": configuration.training,
+    "docs/reference/study.md": configuration.study,
     "docs/reference/ablation.md": configuration.ablation,
     "docs/reference/messages.md": messages.page,
     "docs/reference/manifest.md": configuration.manifest,

@@ -2,8 +2,8 @@
 
     from pathlib import Path
     import matplotlib.pyplot as plt
-    from lpac.api import (SHIPPED_BUNDLE, Scenario, Condition, draw_costs, draw_snapshot, evaluate,
-                          examine, fly, load_bundle, log_arrays, make_evaluation, policy_method)
+    from lpac.api import (SHIPPED_BUNDLE, Method, Scenario, Study, draw_costs, draw_snapshot,
+                          examine, fly, load_bundle, log_arrays, run)
 
     bundle = load_bundle(SHIPPED_BUNDLE)
 
@@ -19,8 +19,8 @@
     draw_snapshot(left, flight.record, time_s=10.0)
     draw_costs(right, {"this policy": flight.record, "Lloyd": lloyd.record})
 
-    evaluation = make_evaluation([policy_method("field", SHIPPED_BUNDLE)], worlds=20)
-    [field, *baselines] = evaluate(evaluation)[Condition("field")]
+    study = Study(methods=(Method.of("field", SHIPPED_BUNDLE), Method.of("decentralized-cvt")))
+    [[field, *baselines]] = run(study).values()     # over 20 worlds
     field.final                                     # (trainings, worlds): J at the end / J(0)
 
     control = log_arrays("out/flight/robots")["robot-3"]["control"]
@@ -81,19 +81,6 @@ if TYPE_CHECKING:
     from lpac.analysis.flight import RobotRecord as RobotRecord
     from lpac.analysis.statistics import VERDICT_RULE as VERDICT_RULE
     from lpac.analysis.statistics import what_would_tell as what_would_tell
-    from lpac.evaluate.evaluation import Condition as Condition
-    from lpac.evaluate.evaluation import Evaluation as Evaluation
-    from lpac.evaluate.evaluation import Method as Method
-    from lpac.evaluate.evaluation import MethodResult as MethodResult
-    from lpac.evaluate.evaluation import verdict_of as verdict_of
-    from lpac.evaluate.figures import cost_curves as cost_curves
-    from lpac.evaluate.figures import distributions as distributions
-    from lpac.evaluate.flights import BASELINES as BASELINES
-    from lpac.evaluate.run import evaluate as evaluate
-    from lpac.evaluate.run import make_evaluation as make_evaluation
-    from lpac.evaluate.run import policy_method as policy_method
-    from lpac.evaluate.worlds import SET_UPS as SET_UPS
-    from lpac.evaluate.worlds import draw_world as draw_world
     from lpac.shipped import SHIPPED_BUNDLE as SHIPPED_BUNDLE
     from lpac.sim.batch import fly_batch as fly_batch
     from lpac.sim.cores import in_this_process as in_this_process
@@ -110,6 +97,18 @@ if TYPE_CHECKING:
     from lpac.sim.ticks import Clocks as Clocks
     from lpac.sim.vehicles import PointVehicles as PointVehicles
     from lpac.sim.vehicles import VehicleOdometry as VehicleOdometry
+    from lpac.study.figures import cost_curves as cost_curves
+    from lpac.study.figures import distributions as distributions
+    from lpac.study.file import read_study as read_study
+    from lpac.study.results import MethodResult as MethodResult
+    from lpac.study.results import verdict_of as verdict_of
+    from lpac.study.run import run as run
+    from lpac.study.study import BASELINES as BASELINES
+    from lpac.study.study import Condition as Condition
+    from lpac.study.study import Method as Method
+    from lpac.study.study import Study as Study
+    from lpac.study.worlds import SET_UPS as SET_UPS
+    from lpac.study.worlds import draw_world as draw_world
 
 # Each module, and what is taken from it: the imports above, when they are needed.
 _TAKEN = {
@@ -129,11 +128,6 @@ _TAKEN = {
     "lpac.analysis.flight": "FlightRecord RobotRecord",
     "lpac.analysis.examination": "Examined Wanted examine",
     "lpac.analysis.statistics": "VERDICT_RULE what_would_tell",
-    "lpac.evaluate.evaluation": "Condition Evaluation Method MethodResult verdict_of",
-    "lpac.evaluate.figures": "cost_curves distributions",
-    "lpac.evaluate.flights": "BASELINES",
-    "lpac.evaluate.run": "evaluate make_evaluation policy_method",
-    "lpac.evaluate.worlds": "SET_UPS draw_world",
     "lpac.shipped": "SHIPPED_BUNDLE",
     "lpac.sim.batch": "fly_batch",
     "lpac.sim.cores": "in_this_process over_cores",
@@ -145,6 +139,12 @@ _TAKEN = {
     "lpac.sim.scenario": "Scenario",
     "lpac.sim.ticks": "Clocks",
     "lpac.sim.vehicles": "PointVehicles VehicleOdometry",
+    "lpac.study.file": "read_study",
+    "lpac.study.figures": "cost_curves distributions",
+    "lpac.study.results": "MethodResult verdict_of",
+    "lpac.study.run": "run",
+    "lpac.study.study": "BASELINES Condition Method Study",
+    "lpac.study.worlds": "SET_UPS draw_world",
 }
 _MODULE_OF = {name: module for module, names in _TAKEN.items() for name in names.split()}
 __all__ = sorted(_MODULE_OF)  # noqa: PLE0605

@@ -6,7 +6,6 @@ the rounds instead of the policy.
 """
 
 import json
-import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -16,9 +15,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.wire import PayloadType
-from lpac.evaluate.worlds import SET_UPS
-from lpac.sim.ticks import Clocks
+from lpac.study.file import condition_of, merged
+from lpac.study.study import Condition
 from lpac.train.config import ReadConfig, TrainingConfig, config_of, read_toml, require_name
 
 BASE = "base"
@@ -33,29 +31,11 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlownAs:
-    """How the flights are that are judged: see `lpac.sim.experiment.Scenario`."""
-
-    loss: float = 0.0
-    delay_s: float = 0.0
-    max_message_age_s: float = 0.8
-    payload: PayloadType = "float16"
-    clocks: Clocks = field(default_factory=Clocks)
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.loss <= 1.0:
-            raise ValueError(f"loss = {self.loss}: must be from 0 to 1")
-        for name in ("delay_s", "max_message_age_s"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be at least 0 and finite")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
     """What is otherwise than in the base: `why` is a sentence that says it to people.
 
-    `train` is merged into the base's configuration, `fly` into its `FlownAs`. One that only flies
-    otherwise has the base's policies.
+    `train` is merged into the base's configuration, `fly` into how that is flown. One that only
+    flies otherwise has the base's policies.
     """
 
     name: str
@@ -77,8 +57,8 @@ class Variant:
 class AblationConfig:
     """The file. `base` is the path of a training's configuration, from the file's folder.
 
-    `train` is merged into that, and `fly` says how flights are, for the base and all variants. All
-    are trained with each of `seeds`, and judged over `worlds` worlds in `set_up`.
+    `train` is merged into that, and `fly` has keys of a study's condition, for the base and all
+    variants. All are trained with each of `seeds`, and judged over `worlds` worlds in `set_up`.
     """
 
     base: str
@@ -104,8 +84,6 @@ class AblationConfig:
             )
         if self.worlds < 1:
             raise ValueError(f"worlds = {self.worlds}: must be at least 1")
-        if self.set_up not in SET_UPS:
-            raise ValueError(f"set_up = {self.set_up!r}: allowed are {', '.join(SET_UPS)}")
         if not 1.0 <= self.duration_s <= 3600.0:
             raise ValueError(f"duration_s = {self.duration_s}: must be from 1 to 3600")
 
@@ -126,7 +104,7 @@ class PlannedVariant:
     name: str
     why: str
     trainings: tuple[PlannedTraining, ...]
-    flown_as: FlownAs
+    condition: Condition
     trained: bool
 
 
@@ -155,13 +133,13 @@ def read_ablation(path: Path) -> Ablation:
     config = from_mapping(AblationConfig, tomllib.loads(read_toml(path)), str(path))
     _require_no_names(config.train, str(path))
     base_path = path.parent / config.base
-    document = _merged(tomllib.loads(read_toml(base_path)), config.train)
+    document = merged(tomllib.loads(read_toml(base_path)), config.train)
     where = f"{path}: {BASE}"
     base = PlannedVariant(
         BASE,
         f"All parts: {base_path.name}.",
         _trainings(BASE, config.seeds, document, where, base_path.parent),
-        from_mapping(FlownAs, config.fly, f"{where}: fly"),
+        _condition(config, BASE, {}, where, path.parent),
         trained=True,
     )
     variants = [base]
@@ -169,14 +147,22 @@ def read_ablation(path: Path) -> Ablation:
         name, where, trainings = variant.name, f"{path}: {variant.name}", base.trainings
         if variant.train:
             _require_no_names(variant.train, where)
-            merged = _merged(document, variant.train)
-            trainings = _trainings(name, config.seeds, merged, where, base_path.parent)
+            changed = merged(document, variant.train)
+            trainings = _trainings(name, config.seeds, changed, where, base_path.parent)
             _require_equal_compute(trainings[0].read.config, base.trainings[0].read.config, where)
-        fly = from_mapping(FlownAs, _merged(config.fly, variant.fly), f"{where}: fly")
+        condition = _condition(config, name, variant.fly, where, path.parent)
         variants.append(
-            PlannedVariant(name, variant.why, trainings, fly, trained=bool(variant.train))
+            PlannedVariant(name, variant.why, trainings, condition, trained=bool(variant.train))
         )
     return Ablation(config, tuple(variants))
+
+
+def _condition(
+    config: AblationConfig, name: str, fly: Mapping[str, object], where: str, folder: Path
+) -> Condition:
+    """Under which a variant flies."""
+    keys = {"set_up": config.set_up, "duration_s": config.duration_s, "title": name}
+    return condition_of({**keys, **merged(config.fly, fly)}, f"{where}: fly", folder)
 
 
 def _trainings(
@@ -185,7 +171,7 @@ def _trainings(
     trainings = []
     for seed in seeds:
         name = f"{variant}-{seed}"
-        own = _merged(document, {"seed": seed, "export": {"name": name}})
+        own = merged(document, {"seed": seed, "export": {"name": name}})
         trainings.append(PlannedTraining(name, seed, config_of(_as_toml(own), where, folder)))
     return tuple(trainings)
 
@@ -205,16 +191,6 @@ def _require_equal_compute(config: TrainingConfig, base: TrainingConfig, where: 
                 f"{where}: train.{key} = {value}: must be the base's, {allowed}, or what is "
                 f"compared would not be as much work{hint}"
             )
-
-
-def _merged(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables key by key; whatever else there is replaces what was."""
-    merged = dict(document)
-    for key, value in changes.items():
-        old = merged.get(key)
-        tables = isinstance(old, Mapping) and isinstance(value, Mapping)
-        merged[key] = _merged(merged[key], value) if tables else value
-    return merged
 
 
 def _as_toml(document: Mapping[str, Any]) -> str:

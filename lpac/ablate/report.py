@@ -1,8 +1,8 @@
 """An ablation as files: ablation.json, a figure, and README.md with the table."""
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -12,17 +12,30 @@ from lpac.ablate.results import VariantResult, as_json, is_claim
 from lpac.analysis import style
 from lpac.analysis.statistics import LEAST_TRAININGS
 from lpac.analysis.style import WIDTH_IN, tidy
-from lpac.train.files import write_atomically
+from lpac.study.provenance import made_by
+from lpac.study.report import Picture, Report, Table
+from lpac.study.study import Condition
 
 _COLOURS = {"better": style.GREEN, "worse": style.VERMILLION, "not distinguishable": style.GREY}
 
 
-def write_report(ablation: Ablation, results: Sequence[VariantResult], folder: Path) -> None:
-    """All of it. Raises OSError."""
-    told = json.dumps(as_json(ablation, results), indent=2) + "\n"
-    write_atomically(folder / "ablation.json", told.encode())
+def write_report(
+    ablation: Ablation, results: Sequence[VariantResult], folder: Path
+) -> dict[str, Any]:
+    """All of it; gives the JSON. Raises OSError."""
     style.save(_differences(results), folder / "differences")
-    write_atomically(folder / "README.md", _text(ablation, results).encode())
+    bundle_ids = dict.fromkeys(each.bundle_id for result in results for each in result.bundles)
+    return Report(
+        name="ablation",
+        title="What each part is worth",
+        text=_text(ablation, results[0].variant.condition),
+        told=as_json(ablation, results),
+        rows=[["variant", "training", "world", "cost_over_first"], *_rows(ablation, results)],
+        tables=[Table(_COLUMNS, [_row(result) for result in results], note=_NOTE)],
+        figures=[Picture("differences.png", "differences to the base")],
+        flown=_FLOWN,
+        made_by=made_by("ablate", list(bundle_ids)),
+    ).write(folder)
 
 
 def no_claim(ablation: Ablation) -> str | None:
@@ -67,43 +80,46 @@ def _differences(results: Sequence[VariantResult]) -> Figure:
         return figure
 
 
-def _text(ablation: Ablation, results: Sequence[VariantResult]) -> str:
-    config, worlds = ablation.config, ablation.worlds
+def _text(ablation: Ablation, base: Condition) -> str:
+    config, worlds, scenario = ablation.config, ablation.worlds, base.scenario
     chosen = (
         "of the validation set that no weights were chosen by"
         if config.world_set == "validation"
         else "of the test set, now opened: if you choose by this, it is no test set any more"
     )
-    claim, flown_as = no_claim(ablation), results[0].variant.flown_as
-    return f"""# What each part is worth
-
-Each variant is the base, except for what its line says. Those that are trained are trained as the
-base is (seeds: {", ".join(map(str, config.seeds))}), in as many flights, states, epochs, rounds and
-candidates; the others fly the base's policies. All fly over the {len(worlds)} worlds
-{worlds.start} to {worlds.stop - 1} {chosen} ({config.set_up},
-{config.duration_s:g} s), the base with {100.0 * flown_as.loss:g} % of messages lost, a delay of
-{flown_as.delay_s:g} s, and payloads in {flown_as.payload}.
-{f"{chr(10)}**{claim[0].upper()}{claim[1:]}.**{chr(10)}" if claim else ""}
-| variant | | trained | mean | over seeds | difference from base | 95 % | |
-| --- | --- | --- | --- | --- | --- | --- | --- |
-{chr(10).join(_row(result) for result in results)}
-
-Cost at the end over that at the start; less is better. "Over seeds" is the standard deviation of
-the trainings' means. The intervals are from a bootstrap that draws worlds in pairs, and
-trainings too: those of a variant and of the base separately, unless they are the same. With few
-trainings the intervals tend to be too narrow; and each stands alone: of twenty, one is expected
-to miss the true value.
-
-![differences to the base](differences.png)
-
-`ablation.json` has all numbers, and each folder beside it a training with its model card.
-"""
+    claim = no_claim(ablation)
+    said = f"\n\n**{claim[0].upper()}{claim[1:]}.**" if claim else ""
+    return (
+        "Each variant is the base, except for what its line says. Those that are trained are "
+        f"trained as the base is (seeds: {', '.join(map(str, config.seeds))}), in as many flights, "
+        "states, epochs, rounds and candidates; the others fly the base's policies. All fly over "
+        f"the {len(worlds)} worlds {worlds.start} to {worlds.stop - 1} {chosen} ({config.set_up}, "
+        f"{config.duration_s:g} s), the base with {100.0 * scenario.loss:g} % of messages lost, a "
+        f"delay of {scenario.delay_s:g} s, and payloads in {scenario.payload}. {_FLOWN}{said}"
+    )
 
 
-def _row(result: VariantResult) -> str:
+_FLOWN = "Points flew."
+_COLUMNS = ("variant", "", "trained", "mean", "over seeds", "difference from base", "95 %", "")
+_NOTE = (
+    'Cost at the end over that at the start; less is better. "Over seeds" is the standard '
+    "deviation of the trainings' means. The intervals are from a bootstrap that draws worlds in "
+    "pairs, and trainings too: those of a variant and of the base separately, unless they are the "
+    "same. With few trainings the intervals tend to be too narrow; and each stands alone: of "
+    "twenty, one is expected to miss the true value. Each training's folder has its model card."
+)
+
+
+def _row(result: VariantResult) -> list[str]:
     variant = result.variant
-    cells = [variant.name, variant.why, "yes" if variant.trained else "no", *numbers_of(result)]
-    return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
+    return [variant.name, variant.why, "yes" if variant.trained else "no", *numbers_of(result)]
+
+
+def _rows(ablation: Ablation, results: Sequence[VariantResult]) -> Iterator[list[object]]:
+    for result in results:
+        for training, costs in zip(result.bundles, result.final.tolist(), strict=True):
+            for world, cost in zip(ablation.worlds, costs, strict=True):
+                yield [result.variant.name, training.bundle_id, world, cost]
 
 
 def numbers_of(result: VariantResult) -> tuple[str, str, str, str, str]:

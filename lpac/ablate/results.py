@@ -1,17 +1,15 @@
-"""What the variants of an ablation came to, and what the data tell of them."""
+"""Results of the variants of an ablation, and whether they differ from the base."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from edge.core import F64
-from lpac.ablate.config import Ablation, PlannedVariant
+from lpac.ablate.config import BASE, Ablation, PlannedVariant
 from lpac.analysis.statistics import LEAST_TRAININGS, Interval95, Verdict, bootstrap, compare
-from lpac.evaluate.evaluation import TrainedBundle
-from lpac.evaluate.flights import POLICY, EvaluationFlight, FlownCost
+from lpac.study.results import MethodResult, scenario_json
+from lpac.study.study import Condition, Method, Study, TrainedBundle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,55 +44,40 @@ class VariantResult:
         return "not distinguishable" if better is None else "better" if better == "a" else "worse"
 
 
-def flights_of(
-    ablation: Ablation, variant: PlannedVariant, bundles: Mapping[str, TrainedBundle]
-) -> list[list[EvaluationFlight]]:
-    """Of each of its trainings one over each world; `bundles` are by the trainings' names."""
-    config, flown_as = ablation.config, variant.flown_as
-    return [
-        [
-            EvaluationFlight(
-                flier=POLICY,
-                bundle=bundles[training.name].path,
-                flown_by=bundles[training.name].bundle_id,
-                world_set=config.world_set,
-                world=world,
-                set_up=config.set_up,
-                duration_s=config.duration_s,
-                loss=flown_as.loss,
-                delay_s=flown_as.delay_s,
-                max_message_age_s=flown_as.max_message_age_s,
-                payload=flown_as.payload,
-                clocks=flown_as.clocks,
-            )
-            for world in ablation.worlds
-        ]
-        for training in variant.trainings
-    ]
+def study_of(ablation: Ablation, bundles: Mapping[str, TrainedBundle]) -> Study:
+    """The flights by which variants are judged: a condition, and often a policy, for each of them.
+
+    `bundles` are by the trainings' names.
+    """
+    return Study(
+        methods=tuple(
+            Method(name=v.name, trainings=tuple(bundles[training.name] for training in v.trainings))
+            for v in ablation.variants
+            if v.trained
+        ),
+        conditions=tuple(
+            replace(v.condition, methods=(v.name if v.trained else BASE,))
+            for v in ablation.variants
+        ),
+        world_set=ablation.config.world_set,
+        first_world=ablation.worlds.start,
+        worlds=len(ablation.worlds),
+    )
 
 
 def results_of(
-    ablation: Ablation,
-    bundles: Mapping[str, TrainedBundle],
-    costs: Mapping[EvaluationFlight, FlownCost],
+    ablation: Ablation, flown: Mapping[Condition, Sequence[MethodResult]]
 ) -> list[VariantResult]:
-    """Of all flights that were flown: each variant's, the base's first.
+    """Each variant's, the base's first; `flown` is what its study came to.
 
     Trainings of a variant and of the base are independent of each other, unless they are the same.
     """
     results: list[VariantResult] = []
-    for variant in ablation.variants:
-        final = np.array(
-            [
-                [costs[flight].cost[-1] / costs[flight].cost[0] for flight in of_training]
-                for of_training in flights_of(ablation, variant, bundles)
-            ]
-        )
+    for variant, (its, *_) in zip(ablation.variants, flown.values(), strict=True):
         verdict = None
         if results:
-            verdict = compare(final, results[0].final, same_trainings=not variant.trained)
-        its_own = tuple(bundles[training.name] for training in variant.trainings)
-        results.append(VariantResult(variant, its_own, final, verdict))
+            verdict = compare(its.final, results[0].final, same_trainings=not variant.trained)
+        results.append(VariantResult(variant, its.method.trainings, its.final, verdict))
     return results
 
 
@@ -125,7 +108,7 @@ def _result_json(result: VariantResult) -> dict[str, Any]:
         "name": variant.name,
         "why": variant.why,
         "trained": variant.trained,
-        "flown_as": asdict(variant.flown_as),
+        "scenario": scenario_json(variant.condition.scenario),
         "bundles": [
             {"path": f"{Path(path).parent.name}/{Path(path).name}", "bundle_id": bundle_id}
             for path, bundle_id in result.bundles

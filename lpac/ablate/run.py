@@ -3,16 +3,15 @@
 import json
 import time
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
 from edge.policy.bundle import load_bundle
 from lpac.ablate.config import Ablation, PlannedTraining
-from lpac.ablate.results import VariantResult, flights_of, results_of
-from lpac.evaluate.evaluation import TrainedBundle
-from lpac.evaluate.flights import EvaluationFlight, FlownCost, KeptFlights
+from lpac.ablate.results import VariantResult, results_of, study_of
 from lpac.sim.cores import Pool
+from lpac.study.run import run
+from lpac.study.study import TrainedBundle
 from lpac.train.files import write_atomically
 from lpac.train.progress import RunProgress
 from lpac.train.run import TrainingRun, require_same_run
@@ -84,23 +83,14 @@ class AblationRun:
         write_atomically(folder / _RESULT, json.dumps(result, indent=2).encode())
 
     def _judge(self, pool: Pool) -> list[VariantResult]:
-        trainings, variants = self._ablation.trainings, self._ablation.variants
-        bundles = {training.name: self._bundle(training) for training in trainings}
-        flights = [
-            flight
-            for variant in variants
-            for of_training in flights_of(self._ablation, variant, bundles)
-            for flight in of_training
-        ]
-        costs: dict[EvaluationFlight, FlownCost] = {}
-        of_all = len(set(flights))
-        with closing(KeptFlights(self._folder).fly(list(dict.fromkeys(flights)), pool)) as flown:
-            for flight, told in flown:
-                costs[flight] = told
-                share = (len(trainings) + len(costs) / of_all) / (len(trainings) + 1)
-                doing = f"flight {len(costs)} of {of_all}"
-                self._tell(AblationProgress(doing, share, None, None))
-        return results_of(self._ablation, bundles, costs)
+        trainings = self._ablation.trainings
+        study = study_of(self._ablation, {each.name: self._bundle(each) for each in trainings})
+
+        def tell(done: int, of: int) -> None:
+            share = (len(trainings) + done / of) / (len(trainings) + 1)
+            self._tell(AblationProgress(f"flight {done} of {of}", share, None, None))
+
+        return results_of(self._ablation, run(study, pool, folder=self._folder, tell=tell))
 
     def _bundle(self, training: PlannedTraining) -> TrainedBundle:
         path = self._folder / training.name / training.name

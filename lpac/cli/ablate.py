@@ -40,7 +40,6 @@ def ablate(
     """Train a method without each of its parts, and say what each of them is worth."""
     from lpac.ablate.config import read_ablation
     from lpac.ablate.report import write_report
-    from lpac.ablate.results import as_json as to_json
     from lpac.ablate.run import AblationRun
 
     read = read_ablation(ablation)
@@ -48,9 +47,9 @@ def ablate(
     folder = out or _OUT / ablation.stem
     with folder_lock("the ablation", folder), _progress() as tell:
         results = AblationRun(read, folder, tell).run(cores)
-        write_report(read, results, folder)
+        told = write_report(read, results, folder)
     if as_json:
-        typer.echo(json.dumps(to_json(read, results), indent=2))
+        typer.echo(json.dumps(told, indent=2))
     else:
         _show(read, results, folder)
 

@@ -1,8 +1,7 @@
 """`lpac evaluate`: policies and baselines over many worlds, and how surely one is better."""
 
-import json
-from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,24 +16,18 @@ from lpac.cli.options import (
     VehicleKind,
     check_px4,
     found,
-    pool_for,
+    require_here,
 )
-from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
-from lpac.cli.transport import WifiFile, calibration, link_line, transport_named, wifi_lines
+from lpac.cli.study import fly_study
+from lpac.cli.transport import WifiFile, calibration, transport_named, wifi_lines
 
 if TYPE_CHECKING:
-    from rich.text import Text
-
-    from edge.core.wire import PayloadType
-    from lpac.evaluate.evaluation import Condition, Evaluation, Method, MethodResult
-    from lpac.evaluate.flights import EvaluationFlight
-    from lpac.sim.cores import Pool
-    from lpac.sim.experiment import SimulatedFlight
+    from lpac.radio.calibration import Calibration
+    from lpac.study.study import Method
 
 app = new_app()
 
 _OUT = Path("out/evaluate")
-_WORST = 10
 
 
 @app.command()
@@ -140,117 +133,95 @@ def evaluate(
     given = methods or [str(DEFAULT_BUNDLE)]
     for path in (part for text in given for part in text.split(",") if "/" in part):
         found(Path(path))
-    from lpac.evaluate.evaluation import as_json as to_json
-    from lpac.radio.modelled import ModelledRadio
-    from lpac.sim.failure import LostRobots
+    from edge.core.wire import PAYLOAD_TYPES
+    from lpac.study.file import condition_of
+    from lpac.study.study import BASELINES, Method, Study
+    from lpac.study.worlds import SET_UPS, WORLD_SETS
 
     check_px4(vehicle, px4)
+    require_here(vehicle, ray)
     if compare and len(given) != 2:
         raise ValueError(f"--compare needs two methods; {len(given)} given")
     if losses and transports:
         raise ValueError("--loss and --transport: the model itself says what is lost")
-    lost_robots = [LostRobots.parse(text) for text in lost or []]
-    calibrated = calibration(wifi, transport=bool(transports))
-    lossy: list[dict[str, Any]] = [
-        *({"loss": loss} for loss in losses or []),
-        *(
-            {"radio": ModelledRadio(transport_named(name), calibrated.wifi)}
-            for name in dict.fromkeys(transports or [])
-        ),
-    ]
-    changes = [
-        *lossy,
-        *({"lost": robots} for robots in lost_robots),
-        *({"lag_s": lag_s} for lag_s in lags or []),
-        *({"position_error_m": error_m} for error_m in position_errors or []),
-        *(
-            {"payload": payload, **loss}
-            for payload in _payload_types(payloads or [])
-            for loss in ({}, *lossy)
-        ),
-        *(
-            {"robot": robot}
-            for robot in ("point-from-pad", vehicle.value)
-            if vehicle is not VehicleKind.POINT
-        ),
-    ]
-    evaluation = _evaluation(
-        given, world_set, worlds, duration, set_ups, changes, baselines, px4, transfer=transfer
-    )
-    # What draws is slow to load, and a bundle that is missing is told by now.
-    from lpac.evaluate.report import write_results
-
-    cores = pool_for(vehicle, ray)
-    results = _fly(evaluation, cores, out)
-    told = to_json(evaluation, results, compared=compare)
-    told["test_set_opened"] = _opened(evaluation)
-    sources = {name: source._asdict() for name, source in calibrated.sources.items()}
-    told["wifi_from"] = sources if transports else None
-    write_results(told, results, out)
-    _write_worst(evaluation, results, cores, out)
-    if as_json:
-        typer.echo(json.dumps(told, indent=2))
-        return
-    _show(told, compared=compare)
-    if transports:
-        typer.echo("\n".join(["what the model assumes of the Wi-Fi:", *wifi_lines(calibrated)]))
-    typer.echo(f"\nsee {out}: evaluation.json, figures, and the worst worlds")
-
-
-def _payload_types(given: Sequence[str]) -> list["PayloadType"]:
-    from edge.core.wire import PAYLOAD_TYPES
-
-    for name in given:
-        if name not in PAYLOAD_TYPES:
-            raise ValueError(f"--payload {name}: must be one of {', '.join(PAYLOAD_TYPES)}")
-    return [known for known in PAYLOAD_TYPES if known in given]
-
-
-def _evaluation(
-    given: Sequence[str],
-    world_set: str,
-    worlds: int,
-    duration_s: float,
-    set_ups: list[str] | None,
-    changes: Sequence[Mapping[str, Any]],
-    baselines: list[str] | None,
-    px4: Path | None,
-    *,
-    transfer: bool,
-) -> "Evaluation":
-    from lpac.evaluate.evaluation import Condition
-    from lpac.evaluate.flights import BASELINES
-    from lpac.evaluate.run import make_evaluation
-    from lpac.evaluate.worlds import SET_UPS, WORLD_SETS
-
-    chosen_sets = [one for one in WORLD_SETS if one == world_set]
-    if not chosen_sets:
-        raise ValueError(f"--set {world_set}: must be one of {', '.join(WORLD_SETS)}")
-    for name in baselines or ():
-        if name not in BASELINES:
-            raise ValueError(f"--baseline {name}: must be one of {', '.join(BASELINES)}")
-    for name in set_ups or ():
-        if name not in SET_UPS:
-            raise ValueError(f"--set-up {name}: must be one of {', '.join(SET_UPS)}")
-    if transfer and any("robot" in change for change in changes):
+    if transfer and vehicle is not VehicleKind.POINT:
         raise ValueError("--transfer has teams that do not fly whole: choose others with --set-up")
     if transfer and set_ups:
         raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
-    names = _names(given)
-    return make_evaluation(
-        [_method(text, name) for text, name in zip(given, names, strict=True)],
-        baselines=[name for name in BASELINES if not baselines or name in baselines],
-        conditions=[
-            condition
-            for name in (SET_UPS if transfer else set_ups or ["field"])
-            for condition in (Condition(name), *(Condition(name, **change) for change in changes))
-        ],
-        world_set=chosen_sets[0],
-        worlds=worlds,
-        duration_s=duration_s,
-        sizes_from=DEFAULT_BUNDLE,
-        px4_build=px4,
+    for option, chosen, known in (
+        ("--set", [world_set], WORLD_SETS), ("--baseline", baselines, BASELINES),
+        ("--set-up", set_ups, tuple(SET_UPS)), ("--payload", payloads, PAYLOAD_TYPES),
+    ):  # fmt: skip
+        for name in chosen or ():
+            if name not in known:
+                raise ValueError(f"{option} {name}: must be one of {', '.join(known)}")
+    calibrated = calibration(wifi, transport=bool(transports))
+    sources = {name: source._asdict() for name, source in calibrated.sources.items()}
+    changes = _changes(
+        losses or [], transports or [], lost or [], lags or [], position_errors or [],
+        [name for name in PAYLOAD_TYPES if name in (payloads or [])], vehicle, calibrated,
+    )  # fmt: skip
+    names = tuple(SET_UPS) if transfer else set_ups or ["field"]
+    policies = [_policy(text, name) for text, name in zip(given, _names(given), strict=True)]
+    flying = [policy.name for policy in policies]
+    policies += [
+        Method.of(name)
+        for name in BASELINES
+        if name not in flying and (not baselines or name in baselines)
+    ]
+    fly_study(
+        Study(
+            methods=tuple(policies),
+            conditions=tuple(
+                condition_of({"set_up": name, "duration_s": duration, **change}, "lpac evaluate")
+                for name in names
+                for change in changes
+            ),
+            world_set=next(known for known in WORLD_SETS if known == world_set),
+            worlds=worlds,
+            px4_build="" if px4 is None else str(px4.resolve()),
+        ),
+        "evaluation",
+        out,
+        ray,
+        as_json=as_json,
+        compared=compare,
+        further={"wifi_from": sources if transports else None},
     )
+    if transports and not as_json:
+        typer.echo("\n".join(["what the model assumes of the Wi-Fi:", *wifi_lines(calibrated)]))
+
+
+def _changes(
+    losses: Sequence[float],
+    transports: Sequence[str],
+    lost: Sequence[str],
+    lags_s: Sequence[float],
+    position_errors_m: Sequence[float],
+    payloads: Sequence[str],
+    vehicle: VehicleKind,
+    calibrated: "Calibration",
+) -> list[dict[str, Any]]:
+    """The keys of each condition, as a study has them; the first is as usual."""
+    wifi = asdict(calibrated.wifi)
+    lossy: list[dict[str, Any]] = [
+        *({"loss": loss} for loss in losses),
+        *(
+            {"radio": {"transport": transport_named(name), "wifi": wifi}}
+            for name in dict.fromkeys(transports)
+        ),
+    ]
+    whole: list[dict[str, Any]]
+    whole = [] if vehicle is VehicleKind.POINT else [{"from_pads": True}, {"engine": vehicle.value}]
+    return [
+        {},
+        *lossy,
+        *({"lost": robots} for robots in lost),
+        *({"lag_s": lag_s} for lag_s in lags_s),
+        *({"position_error_m": error_m} for error_m in position_errors_m),
+        *({"payload": payload, **loss} for payload in payloads for loss in ({}, *lossy)),
+        *whole,
+    ]
 
 
 def _names(given: Sequence[str]) -> list[str]:
@@ -263,189 +234,8 @@ def _names(given: Sequence[str]) -> list[str]:
     return names
 
 
-def _method(text: str, name: str) -> "Method":
+def _policy(text: str, name: str) -> "Method":
     """A baseline by its name, or bundles by their paths. Raises BundleError."""
-    from lpac.evaluate.evaluation import Method
-    from lpac.evaluate.flights import BASELINES
-    from lpac.evaluate.run import policy_method
+    from lpac.study.study import BASELINES, Method
 
-    for baseline in BASELINES:
-        if baseline == text:
-            return Method(name=baseline, flier=baseline)
-    return policy_method(name, *map(Path, text.split(",")))
-
-
-def _fly(
-    evaluation: "Evaluation", cores: "Pool", out: Path
-) -> dict["Condition", list["MethodResult"]]:
-    from lpac.evaluate.run import evaluate as fly_all
-
-    with progress_of("flights") as progress:
-        task = progress.add_task("", total=None)
-
-        def tell(done: int, of: int) -> None:
-            progress.update(task, completed=done, total=of)
-
-        return fly_all(evaluation, cores, folder=out, tell=tell)
-
-
-def _opened(evaluation: "Evaluation") -> dict[str, Any] | None:
-    """Of the test set: by whom, when, and how many worlds of it. None if another was looked at."""
-    if evaluation.world_set != "test":
-        return None
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "bundle_ids": [
-            training.bundle_id for method in evaluation.methods for training in method.trainings
-        ],
-        "worlds": evaluation.worlds,
-    }
-
-
-def _write_worst(
-    evaluation: "Evaluation",
-    results: Mapping["Condition", Sequence["MethodResult"]],
-    cores: "Pool",
-    out: Path,
-) -> None:
-    """Of each policy, under the first condition: its worst worlds, flown again."""
-    from lpac.evaluate.evaluation import CLAIRVOYANT, worst_worlds
-    from lpac.evaluate.flights import fly_group, groups_of
-    from lpac.evaluate.report import write_world
-
-    condition, of_all = next(iter(results.items()))
-    clairvoyant = next(r.method for r in of_all if r.method.name == CLAIRVOYANT)
-    wanted = {
-        (result.method.name, place, world): [
-            next(evaluation.flights_of(method, condition, world))
-            for method in (result.method, clairvoyant)
-        ]
-        for result in of_all
-        if result.method.trained
-        for place, world in enumerate(worst_worlds(result, _WORST), 1)
-    }
-    flights = list(dict.fromkeys(flight for pair in wanted.values() for flight in pair))
-    flown: dict[EvaluationFlight, SimulatedFlight] = {}
-    with progress_of("pictures of the worst worlds") as progress:
-        task = progress.add_task("", total=len(flights) + len(wanted))
-        for group in cores(fly_group, groups_of(flights)) if flights else ():
-            flown.update(group)
-            progress.update(task, advance=len(group))
-        for (name, place, world), pair in wanted.items():
-            shown = {str(flight.flier): flown[flight] for flight in pair}
-            write_world(
-                shown, out / "worst" / name.replace("/", "-") / f"{place:02d}-world-{world}"
-            )
-            progress.update(task, advance=1)
-
-
-def _show(told: Mapping[str, Any], *, compared: bool) -> None:
-    from lpac.analysis.statistics import VERDICT_RULE
-
-    policies = [method["name"] for method in told["methods"] if method["bundles"]]
-    for condition in told["conditions"]:
-        typer.echo(
-            f"{condition['name']}: {told['worlds']} worlds of the {told['world_set']} set, "
-            f"{told['duration_s']:g} s; cost at the end over that at the start\n"
-        )
-        radio = condition["radio_model"]
-        if radio is not None:
-            typer.echo(f"{link_line(radio['loss'], radio['delay_s'])}\n")
-        of_all = condition["results"]
-        print_table(_COLUMNS, [_row(one) for one in of_all], right=_COLUMNS[1:])
-        typer.echo(f"\n{_COLUMNS_SAY}")
-        of_policies = [one for one in of_all if one["name"] in policies]
-        for one in of_policies:
-            typer.echo(
-                f"\n{one['name']}: {_share(one['fails'])} of the worlds end above "
-                f"{told['fails_above']:g} x clairvoyant; in {_share(one['rises_again'])} costs "
-                "rise again"
-            )
-        if of_policies:
-            typer.echo()
-            rows = [
-                [baseline["name"], *(_against(one, baseline["name"]) for one in of_policies)]
-                for baseline in of_all
-                if baseline not in of_policies
-            ]
-            print_table(("against", *policies), rows)
-            typer.echo(f"\n{VERDICT_RULE}; else they are not told apart")
-        if compared:
-            _show_verdict(condition["compared"], *told["methods"][:2], worlds=told["worlds"])
-        typer.echo()
-    opened = told["test_set_opened"]
-    if opened is not None:
-        typer.echo(
-            f"the test set was opened, {opened['worlds']} worlds of it: if you choose by this, "
-            "it is no test set any more"
-        )
-
-
-_COLUMNS = (
-    "", "mean\nJ / J(0)", "95 %", "p90", "worst", "area", "vs\nclair-\nvoyant", "p90",
-    "vs\nbest\nLloyd",
-)  # fmt: skip
-_COLUMNS_SAY = (
-    "J / J(0): cost at the end over that at the start: its mean over the worlds and in which "
-    "interval that is, at 95 % confidence; p90: nine worlds of ten end below, worst: the worst "
-    "one\n"
-    "area: the mean of J / J(0) over the flight, so the area under its curve\n"
-    "vs clairvoyant: how many times that of Lloyd's algorithm that knows the world, mean over "
-    "mean, and, world by world, p90\n"
-    "vs best Lloyd: how many times that of the best of ten such runs, in each world"
-)
-
-
-def _row(result: Mapping[str, Any]) -> list[str]:
-    final, over = result["final"], result["over_clairvoyant"]
-    mean, low, high = final["mean"]
-    return [
-        result["name"],
-        f"{mean:.3f}",
-        f"{low:.3f}-{high:.3f}",
-        f"{final['quantiles']['0.9']:.3f}",
-        f"{final['worst']:.3f}",
-        f"{result['area']['mean'][0]:.3f}",
-        f"{over['ratio_of_means'][0]:.3f}",
-        f"{over['quantiles']['0.9']:.2f}",
-        f"{result['over_best_of_ten']['ratio_of_means'][0]:.3f}",
-    ]
-
-
-def _share(told: Mapping[str, Any]) -> str:
-    """With how much it may be in truth."""
-    share, bound = 100.0 * told["share"], 100.0 * told["at_most_share"]
-    return f"{share:.3g} % (95 %: at most {bound:.3g})"
-
-
-def _against(policy: Mapping[str, Any], baseline: str) -> "Text":
-    """Whether better, and in how many worlds it ends above the baseline."""
-    above, verdict = policy["above"][baseline], policy["against"][baseline]
-    text = {"a": "better", "b": "worse", None: "not told apart"}[verdict["better"]]
-    style = {"a": GOOD, "b": BAD, None: ""}[verdict["better"]]
-    return styled(f"{text}, above it in {100.0 * above['share']:.3g} %", style)
-
-
-def _show_verdict(
-    verdict: Mapping[str, Any], a: Mapping[str, Any], b: Mapping[str, Any], *, worlds: int
-) -> None:
-    from lpac.analysis.statistics import Interval95, what_would_tell
-
-    ratio, below = verdict["ratio"], verdict["a_below_b"]
-    if verdict["better"] is None:
-        said = f"the data do not show whether {a['name']} or {b['name']} is better"
-    else:
-        better, worse = (a, b) if verdict["better"] == "a" else (b, a)
-        said = f"{better['name']} is better than {worse['name']}"
-    typer.echo(
-        f"\n{said}: cost at the end {ratio[0]:.3f} times (95 %: {ratio[1]:.3f} to {ratio[2]:.3f}), "
-        f"lower in {100.0 * below[0]:.3g} % of the worlds ({100.0 * below[1]:.3g} to "
-        f"{100.0 * below[2]:.3g})"
-    )
-    if verdict["better"] is None:
-        typer.echo(what_would_tell(Interval95(*verdict["difference"]), worlds))
-    if not verdict["of_methods"]:
-        typer.echo(
-            "that is true of these bundles; it takes three trainings of each, joined by commas, to "
-            "say it of the methods"
-        )
+    return Method.of(text) if text in BASELINES else Method.of(name, *text.split(","))

@@ -21,6 +21,9 @@ _COMMANDS = {
     "evaluate": (
         "Policies and baselines over many worlds: how well they cover, with confidence intervals."
     ),
+    "study": (
+        "Fly an experiment of yours, from a TOML file: policies over worlds, under conditions."
+    ),
     "train": (
         "Train a policy, or continue where a training stopped, keeping the weights that fly best."
     ),
@@ -48,7 +51,7 @@ _COMMANDS = {
 }
 # The extra that has a command's packages; without one they are in every install.
 _EXTRAS = {
-    "sim": ("demo", "sim", "evaluate", "paper", "drill", "hosts"),
+    "sim": ("demo", "sim", "evaluate", "study", "paper", "drill", "hosts"),
     "ground": ("ground", "mission", "watch", "map", "site", "record", "report"),
     "fleet": ("fleet",),
     "foxglove": ("foxglove",),
@@ -58,7 +61,7 @@ _EXTRAS = {
 }
 _INTERRUPTED = 130
 # What these have done is on the disk.
-_GO_ON = ("train", "ablate", "evaluate", "drill")
+_GO_ON = ("train", "ablate", "evaluate", "study", "drill")
 
 
 class _Lpac(CommandList):

@@ -83,15 +83,10 @@ def pool(ray: str | None) -> "Pool":
     return over_ray(ray)
 
 
-def pool_for(vehicle: VehicleKind, ray: str | None) -> "Pool":
-    """As `pool`; in real time flights go one after another, and nothing beside them."""
-    if vehicle not in IN_REAL_TIME:
-        return pool(ray)
-    if ray is not None:
+def require_here(vehicle: VehicleKind, ray: str | None) -> None:
+    """Raise ValueError if flights in real time were to go to a cluster."""
+    if vehicle in IN_REAL_TIME and ray is not None:
         raise ValueError(f"--ray does nothing with --vehicle {vehicle.value}: it flies here")
-    from lpac.sim.cores import in_this_process
-
-    return in_this_process
 
 
 def folder_lock(what: str, folder: Path) -> "ProcessLock":

@@ -47,8 +47,6 @@ app = new_app()
 
 DEFAULT_OUT = Path("out/sim")
 DEFAULT_ROBOTS = 10
-# Images and actions count for so long, s, or for two periods, if that is longer.
-_INPUT_AGE_S = 1.0
 
 
 class Controller(StrEnum):
@@ -91,7 +89,8 @@ class Scale(StrEnum):
 _OPTIONS = {
     "communication_range": "--range", "control_hz": "--control-hz", "delay_s": "--delay",
     "duration": "--duration", "features": "--features", "lag_s": "--lag", "loss": "--loss",
-    "max_message_age_s": "--max-message-age", "robots": "--robots", "seed": "--seed",
+    "max_message_age_s": "--max-message-age", "position_error_m": "--position-error",
+    "robots": "--robots", "seed": "--seed",
     "world_size": "--world-size",
 }  # fmt: skip
 _OPTION_OF = re.compile(rf"\b({'|'.join(_OPTIONS)}) = ")
@@ -279,7 +278,6 @@ def sim(
     world_features = parse_world(_text(world), str(world)) if world else None
     _require_something_to_cover(world, world_features, features)
     clocks = _clocks(perception_hz, policy_hz, control_hz, synchronous=synchronous)
-    max_input_age_s = max(_INPUT_AGE_S, 2.0 * clocks.perception_s, 2.0 * clocks.policy_s)
     model = FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0)
     starts_m = None if starts is None else _starts(starts, count, bundle, world_size, model)
     from lpac.radio.modelled import ModelledRadio
@@ -305,13 +303,12 @@ def sim(
         delay_s=delay,
         radio=ModelledRadio(transport.value, found.wifi) if transport and is_point else None,
         max_message_age_s=max_message_age,
-        max_input_age_s=max_input_age_s,
         payload=payload.value,
         world_size=world_size,
         communication_range=communication_range,
         lag_s=lag,
         failures=_failures(lost, away or (), team, duration),
-        position_bias=_position_bias(seed, position_error, team, model),
+        position_error_m=position_error,
         clocks=clocks,
         errors=errors,
         sensor=sensor,
@@ -730,20 +727,6 @@ def _starts(
     if len(starts_m) != robots:
         raise ValueError(f"{path}: has {len(starts_m)} starts, and there are {robots} robots")
     return tuple(starts_m)
-
-
-def _position_bias(
-    seed: int, deviation_m: float, robots: int, scale: "ModelScale"
-) -> tuple[tuple[float, float], ...] | None:
-    """What robots take themselves to be off by, in model units."""
-    from lpac.sim.experiment import draw_position_errors_m
-
-    if not 0.0 <= deviation_m < math.inf:
-        raise ValueError(f"--position-error {deviation_m:g}: must be at least 0 and finite")
-    if deviation_m == 0.0 or robots < 1:
-        return None
-    errors_m = draw_position_errors_m(seed, deviation_m, robots)
-    return tuple((x, y) for x, y in (errors_m * scale.env_scale).tolist())
 
 
 def _clocks(

@@ -13,11 +13,11 @@ import numpy as np
 
 from edge.core.counted import counted
 from lpac.analysis.statistics import Interval95
-from lpac.evaluate.worlds import FIELD, SET_UPS
-from lpac.paper.asynchrony import FIELD as FIELD_TIMING
-from lpac.paper.asynchrony import TIMES_S, Timing
-from lpac.paper.experiments import E2_DURATION_S, WHOLE_ROBOTS
 from lpac.radio.airtime import Traffic, Transport, Wifi, carries
+from lpac.study.rates import FIELD as FIELD_TIMING
+from lpac.study.rates import Timing
+from lpac.study.summary import WHOLE_ROBOTS
+from lpac.study.worlds import FIELD, SET_UPS
 
 Json = Mapping[str, Any]
 
@@ -143,7 +143,7 @@ def _decentralised(e3: Json) -> Claim:
 
 
 def _e1(e1: Json) -> list[Claim]:
-    worlds = e1["worlds"]
+    worlds = e1["flights"]
     flown = [its.get(WHOLE_ROBOTS, its["lpac"]) for its in worlds.values()]
     settled_s = [_settled_s(flight) for flight in flown]
     ends_s = [flight["time_s"][-1] for flight in flown]
@@ -197,9 +197,9 @@ def _e2(e2: Json) -> list[Claim]:
             "E2: repeatable under GPS errors",
             "Three trials in one world, with robots placed within 10 cm: the curves differ, the "
             "costs at the end are similar, and GPS scatters where robots start and end.",
-            f"{E2_DURATION_S:g} s after the takeoff command, as in the paper's figure, or of the "
-            "mission where there is no takeoff, the costs' standard deviation is at most a fifth "
-            "of their mean.",
+            f"{e2['looked_at_s']:g} s after the takeoff command, as in the paper's figure, or of "
+            "the mission where there is no takeoff, the costs' standard deviation is at most a "
+            "fifth of their mean.",
             f"{len(e2['trials'])} trials: {mean:.3f} after {spread['end_s']:.0f} s, standard "
             f"deviation {final:.3f}, {100.0 * final / mean:.0f} % of it, and before that up to "
             f"{spread['largest_deviation_in_flight']:.3f}. On average a robot ends "
@@ -275,7 +275,8 @@ def _asynchrony(told: Json) -> list[Claim]:
     slower = [t for t in own if t.policy_hz < FIELD_TIMING.policy_hz]
     faster = [t for t in own if t.policy_hz > FIELD_TIMING.perception_hz]
     together = FIELD_TIMING._replace(synchronous=True)
-    count = f"{told['worlds']} worlds, cost at {TIMES_S[-1]:g} s over that with the field's rates"
+    end_s = told["times_s"][-1]
+    count = f"{told['worlds']} worlds, cost at {end_s:g} s over that with the field's rates"
     in_step = by_timing[together][-1]
     verdict = Agreement.OPEN
     if in_step.low >= 1.0 / _ASYNCHRONOUS:

@@ -12,14 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from edge.core.wire import most_bytes
-from edge.drivers.registry import load_policy
-from edge.identity.envelope import OVERHEAD_BYTES
-from edge.messages.beacon import BEACON_BYTES
 from edge.policy.bundle import Bundle
-from edge.policy.family import Observation, PolicyStep
 from lpac.analysis.page import CLOSING, figure, opening
 from lpac.paper.claims import Agreement, Claim, Effort, Experiments, Sizes, claims_of
+from lpac.study.hearing_robot import HearingRobot, message_bytes
 
 _NARROW = ("staleness",)
 # Of which the median is how long one takes.
@@ -116,18 +112,12 @@ def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, 
 
 def sizes_of(bundle: Bundle) -> Sizes:
     """Of the messages of a bundle's policy. Raises BundleError if no robot can fly it."""
-    assert bundle.manifest.perception is not None
-    sizes = []
-    for others in (2, 100):
-        said = _Among(others, bundle).step().payload
-        of_policy = most_bytes(said.size, "float16", bundle.manifest.perception.shared_map_side)
-        sizes.append(BEACON_BYTES + of_policy + OVERHEAD_BYTES)
-    return Sizes(*sizes)
+    return Sizes(*(message_bytes(bundle, others) for others in (2, 100)))
 
 
 def effort_of(bundle: Bundle) -> Effort:
     """Of a bundle's policy, medians, on this machine. Raises BundleError if no robot can fly it."""
-    robots = [_Among(others, bundle) for others in (2, 100)]
+    robots = [HearingRobot(others, bundle) for others in (2, 100)]
     took_s = np.zeros((_STEPS, len(robots)))
     # In turns, so that what else the machine does meanwhile hits both.
     for step, number in itertools.product(range(_STEPS), range(len(robots))):
@@ -135,30 +125,6 @@ def effort_of(bundle: Bundle) -> Effort:
         robots[number].step()
         took_s[step, number] = time.perf_counter() - began_s
     return Effort(*np.median(took_s, axis=0).tolist())
-
-
-class _Among:
-    """A robot among so many others around it, all of which it hears."""
-
-    def __init__(self, others: int, bundle: Bundle) -> None:
-        policy, perception = load_policy(bundle), bundle.manifest.perception
-        assert perception is not None
-        self._agent = policy.agent()
-        rng = np.random.default_rng(0)
-        middle = np.full(2, perception.world_size / 2.0)
-        reach = perception.communication_range / 2.0
-        self._observed = Observation(
-            middle,
-            rng.random((perception.local_map_size,) * 2, np.float32),
-            middle + rng.uniform(-reach, reach, (others, 2)),
-            np.zeros(2),
-        )
-        self._heard = list(rng.random((others, policy.message_size), np.float32))
-
-    def step(self) -> PolicyStep:
-        """Perceive and decide."""
-        features = self._agent.observe(self._observed).features
-        return self._agent.step(features, self._heard, len(self._heard))
 
 
 def _claim_json(claim: Claim) -> dict[str, Any]:

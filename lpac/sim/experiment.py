@@ -154,7 +154,7 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
     Raises BundleError for a bundle without perception, ValueError for impossible sizes and link
     parameters.
     """
-    scenario.require_default("points", "errors", "budget", "sensor", "secure", "transport")
+    require_points(scenario)
     scale, training = scenario.scale, bundle.manifest.training
     perception = scenario.perception_of(bundle)
     bundle = replace(bundle, manifest=replace(bundle.manifest, perception=perception))
@@ -165,9 +165,6 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
     max_speed_m_s = scenario.max_speed_m_s
     if max_speed_m_s is None:
         max_speed_m_s = training.max_speed * scale.velocity_scale
-    bias_m: F64 | None = None
-    if scenario.position_bias is not None:
-        bias_m = scale.position_to_mission_m(np.array(scenario.position_bias, np.float64))
     link = scenario.link
     return Preparation(
         scenario=scenario,
@@ -177,7 +174,7 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
             scale=scale,
             max_speed_m_s=max_speed_m_s,
             max_message_age_s=scenario.max_message_age_s,
-            max_input_age_s=scenario.max_input_age_s,
+            max_input_age_s=scenario.input_age_s,
             payload=scenario.payload,
         ),
         features=features,
@@ -185,7 +182,7 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
             features, perception.world_size, training.idf_truncation, training.idf_norm
         ),
         starts_m=_starts_m(scenario, perception.world_size, start_rng),
-        bias_m=bias_m,
+        bias_m=_bias_m(scenario),
         times_s=_sample_times_s(scenario.duration_s),
         clock_rng=clock_rng,
         medium=Medium(
@@ -194,6 +191,13 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
             delay_s=link.delay_s,
             rng=medium_rng,
         ),
+    )
+
+
+def require_points(scenario: Scenario) -> None:
+    """Raise ValueError for what points cannot do."""
+    scenario.require_default(
+        "points", "errors", "wind_m_s", "budget", "sensor", "secure", "transport"
     )
 
 
@@ -381,9 +385,17 @@ def _sample_times_s(duration_s: float) -> list[float]:
     return [*(sample * SAMPLE_S for sample in range(samples)), duration_s]
 
 
-def draw_position_errors_m(seed: int, deviation_m: float, robots: int) -> F64:
-    """(robots, 2): how wrong each is about where it is, normal along each axis."""
-    return np.random.default_rng(seed).normal(0.0, deviation_m, (robots, 2))
+def _bias_m(scenario: Scenario) -> F64 | None:
+    """(robots, 2): how wrong each is about where it is; None if nobody is."""
+    bias_m: F64 | None = None
+    if scenario.position_bias is not None:
+        bias = np.array(scenario.position_bias, np.float64)
+        bias_m = scenario.scale.position_to_mission_m(bias)
+    if scenario.position_error_m:
+        rng, size = np.random.default_rng(scenario.seed), (scenario.robots, 2)
+        error_m = rng.normal(0.0, scenario.position_error_m, size)
+        bias_m = error_m if bias_m is None else error_m + bias_m
+    return bias_m
 
 
 def _starts_m(scenario: Scenario, world_size: int, rng: np.random.Generator) -> F64:

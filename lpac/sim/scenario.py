@@ -1,12 +1,14 @@
 """One flight, described for all engines."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
+from edge.core.schema import AtLeastOne, Bounded, Finite, NonNegative, Positive, Share
 from edge.core.wire import MAX_ROBOT_ID, PayloadType
 from edge.core.world import Feature, random_features
 from edge.flight.margins import ErrorBudget
@@ -19,15 +21,22 @@ from lpac.sim.description import ERRORS, FIELD_SCALE
 from lpac.sim.failure import Failure, require_possible
 from lpac.sim.ticks import Clocks
 
+if TYPE_CHECKING:
+    Features = tuple[Feature, ...]
+else:
+    # Files name a world's file instead: msgspec takes no union of dataclasses.
+    Features = tuple
+
 # The sensor's type that every installation has.
 WORLD_SENSOR = "world"
 Controller = Literal["lpac"] | BaselineName
 
 MAX_ROBOTS = MAX_ROBOT_ID + 1
+_INPUT_AGE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scenario:
+class Scenario(Bounded):
     """One flight: who flies what, over which world, and what is wrong with it.
 
     Everything random follows from `seed`, but for the timing of programs in real time. All engines
@@ -42,84 +51,82 @@ class Scenario:
     Team: `starts_m` is one position in the mission frame per robot; else points start anywhere in
     the world, and whole robots where there is room. `failures` are robots that are away: points
     fail, whole robots are taken out of the fence by a pilot. Ages and `payload` are those of
-    `PacParameters`, and `clocks` the periods of the robots' loops.
+    `PacParameters`, and `clocks` the periods of the robots' loops. Where `max_input_age_s` is None,
+    inputs count for two of the longest periods, and for 1 s at least.
 
     Radio: `loss` is the probability that a message is lost, `delay_s` how late it is on average; of
     whole robots from the mission's start on.
 
     Points alone: `controller` may be a baseline, which knows true positions and needs no radio;
     `max_speed_m_s` is the bundle's where it is None; `position_bias` is, per robot and in model
-    units, how wrong its position is; vehicles follow a velocity with the time constant `lag_s`;
-    with a `radio` its model says what is lost and late.
+    units, how wrong its position is, to which an error of the standard deviation `position_error_m`
+    along each axis is added; vehicles follow a velocity with the time constant `lag_s`; with a
+    `radio` its model says what is lost and late.
 
     Whole robots alone: without `errors` their estimates are off by noise alone, and there is no
-    wind; `budget` is the error they allow for; `sensor` the `type` in robot.toml's [sensor]; with
+    wind; `wind_m_s` is the mean wind, drawn from the seed where it is None, with gusts of up to
+    8 m/s; `budget` is the error they allow for; `sensor` the `type` in robot.toml's [sensor]; with
     `secure` the fleet has keys; `transport` is that of fleet.toml's [radio].
 
     Raises ValueError that names what is impossible.
     """
 
     controller: Controller = "lpac"
-    robots: int = 10
-    seed: int = 0
-    duration_s: float = 60.0
-    features: tuple[Feature, ...] | None = None
-    random_feature_count: int = 10
-    starts_m: tuple[tuple[float, float], ...] | None = None
+    robots: Annotated[int, Meta(ge=1, le=MAX_ROBOTS)] = 10
+    seed: Annotated[int, Meta(ge=0)] = 0
+    duration_s: Positive = 60.0
+    features: Features | None = None
+    random_feature_count: Annotated[int, Meta(ge=0)] = 10
+    starts_m: tuple[tuple[Finite, Finite], ...] | None = None
     scale: ModelScale = FIELD_SCALE
-    loss: float = 0.0
-    delay_s: float = 0.0
+    loss: Share = 0.0
+    delay_s: NonNegative = 0.0
     radio: ModelledRadio | None = None
-    max_message_age_s: float = 0.8
-    max_input_age_s: float = 1.0
+    max_message_age_s: NonNegative = 0.8
+    max_input_age_s: NonNegative | None = None
     payload: PayloadType = "float16"
-    random_feature_sigma: tuple[float, float] = (40.0, 60.0)
-    world_size: int | None = None
-    communication_range: float | None = None
-    max_speed_m_s: float | None = None
-    lag_s: float = 0.0
-    position_bias: tuple[tuple[float, float], ...] | None = None
+    random_feature_sigma: tuple[Positive, Positive] = (40.0, 60.0)
+    world_size: AtLeastOne | None = None
+    communication_range: Positive | None = None
+    max_speed_m_s: Positive | None = None
+    lag_s: NonNegative = 0.0
+    position_bias: tuple[tuple[Finite, Finite], ...] | None = None
+    position_error_m: NonNegative = 0.0
     failures: tuple[Failure, ...] = ()
     clocks: Clocks = field(default_factory=Clocks)
     errors: bool = True
+    wind_m_s: NonNegative | None = None
     budget: ErrorBudget = ERRORS
     sensor: str = WORLD_SENSOR
     secure: bool = False
     transport: Transport = "mesh"
 
-    def __post_init__(self) -> None:
-        if self.robots < 1:
-            raise ValueError(f"robots = {self.robots}: must be at least 1")
-        if self.robots > MAX_ROBOTS:
-            raise ValueError(f"robots = {self.robots}: must be at most {MAX_ROBOTS}")
-        if self.seed < 0:
-            raise ValueError(f"seed = {self.seed}: must be at least 0")
+    def check_rules(self) -> None:
+        """See `Bounded`."""
         for name, of_each in (("starts_m", self.starts_m), ("position_bias", self.position_bias)):
             if of_each is not None and len(of_each) != self.robots:
                 raise ValueError(f"{name}: {len(of_each)} positions for {self.robots} robots")
-        if not 0.0 < self.duration_s < np.inf:
-            raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
-        if self.random_feature_count < 0:
-            raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
         if self.radio is not None and (self.loss or self.delay_s):
             raise ValueError(
                 f"loss = {self.loss}, delay_s = {self.delay_s}: must be 0 with a modelled radio"
             )
-        if not 0.0 <= self.max_message_age_s < np.inf:
-            raise ValueError(
-                f"max_message_age_s = {self.max_message_age_s}: must be at least 0 and finite"
-            )
         least, greatest = self.random_feature_sigma
-        if not 0.0 < least <= greatest < np.inf:
+        if not least <= greatest:
             raise ValueError(
-                f"random_feature_sigma = {self.random_feature_sigma}: must be (least, greatest) "
-                "above 0"
+                f"random_feature_sigma = {self.random_feature_sigma}: must be (least, greatest)"
             )
         if self.controller != "lpac" and self.failures:
             raise ValueError(f"controller = {self.controller!r}: a baseline knows no failures")
         if self.controller != "lpac" and self.radio is not None:
             raise ValueError(f"controller = {self.controller!r}: a baseline needs no radio")
         require_possible(self.failures, self.robots)
+
+    @property
+    def input_age_s(self) -> float:
+        """For how long images and actions count."""
+        if self.max_input_age_s is not None:
+            return self.max_input_age_s
+        return max(_INPUT_AGE_S, 2.0 * self.clocks.perception_s, 2.0 * self.clocks.policy_s)
 
     @property
     def link(self) -> LinkQuality:

@@ -10,14 +10,15 @@ from matplotlib.figure import Figure
 
 from edge.policy.bundle import Bundle
 from lpac.analysis import style
+from lpac.analysis.figures import snapshots_and_costs
 from lpac.analysis.style import WIDTH_IN, tidy
-from lpac.evaluate.flights import POLICY, fly_group, sizes_of
-from lpac.evaluate.report import write_world
 from lpac.sim.baselines import BaselineName
+from lpac.study.flights import records_of
+from lpac.study.study import Method
 from lpac.train.config import TrainingConfig
 from lpac.train.files import write_atomically
 from lpac.train.fit import EpochLoss
-from lpac.train.select import ClosedLoopCost, JudgedCandidate, flights_of
+from lpac.train.select import ClosedLoopCost, JudgedCandidate, flights_of, policy_of
 from lpac.train.task import CLAIRVOYANT
 
 
@@ -62,14 +63,14 @@ def write_card(card: ModelCard, folder: Path, bundle: Bundle, path: Path) -> Non
 def _write_worlds(card: ModelCard, figures: Path, bundle: Bundle, path: Path) -> None:
     """How the policy covered two of them, beside who knows all."""
     select = card.config.select
-    flights = flights_of(select, POLICY, path, bundle.id)
-    clairvoyant = flights_of(select, CLAIRVOYANT, path, sizes_of(bundle))
+    flights = flights_of(select, policy_of(path, bundle), path)
+    clairvoyant = flights_of(select, Method.of(CLAIRVOYANT), path)
     for name, index in (("first", 0), ("worst", card.best.cost.worst_flight)):
         flown = {
-            "lpac": fly_group((flights[index],))[0][1],
-            CLAIRVOYANT: fly_group((clairvoyant[index],))[0][1],
+            "lpac": records_of((flights[index],))[0][1],
+            CLAIRVOYANT: records_of((clairvoyant[index],))[0][1],
         }
-        write_world(flown, figures / f"{name}-world")
+        style.save(snapshots_and_costs(flown), figures / f"{name}-world")
 
 
 def _losses(card: ModelCard) -> Figure:

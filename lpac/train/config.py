@@ -25,10 +25,10 @@ from edge.core.schema import (
 from edge.core.world import MOST_FEATURES
 from edge.policy.bundle import Training
 from export.parameters import PolicyParameters
-from lpac.evaluate.worlds import SET_UPS
 from lpac.sim.description import FIELD_SCALE
 from lpac.sim.scenario import MAX_ROBOTS
 from lpac.sim.ticks import Clocks
+from lpac.study.worlds import SET_UPS
 from lpac.train.family import Learnable, StateDict, learnable
 
 ExpertName = Literal["clairvoyant-cvt", "best-of-lloyd", "exploring-cvt"]

@@ -16,11 +16,11 @@ from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters
 from edge.policy.bundle import Bundle
 from edge.policy.family import Observation
-from lpac.evaluate.worlds import SetUp, draw_world
 from lpac.sim.batch import BatchedFlights, BatchMoment, PolicyFailedError
 from lpac.sim.batch.agents import Agents, Inputs, PolicySteps, make_agents
 from lpac.sim.failure import Failure
 from lpac.sim.scenario import Scenario
+from lpac.study.worlds import SetUp, draw_world
 from lpac.train.config import DaggerConfig, DataConfig, Disturbances
 from lpac.train.expert import LOOK_PERIOD_S
 from lpac.train.task import CoverageTask, Task, Teacher
@@ -33,19 +33,13 @@ _WORLDS_PER_SEED = 1_000_000
 _FIRST_STATE_S = 0.5
 
 
-class PlannedFlight(NamedTuple):
-    """A flight, and whether the expert flies it, or the policy."""
-
-    scenario: Scenario
-    by_expert: bool
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedShard:
-    """Flights whose states are kept together, those at `times_s`."""
+    """Flights whose states are kept together, those at `times_s`; the expert flies some of them."""
 
     name: str
-    flights: tuple[PlannedFlight, ...]
+    scenarios: tuple[Scenario, ...]
+    by_expert: tuple[bool, ...]
     times_s: tuple[float, ...]
     data: DataConfig
 
@@ -82,17 +76,18 @@ def plan_round(
     first = 0 if round_ == 0 else data.flights + (round_ - 1) * dagger.flights
     duration_s = data.duration_s if round_ == 0 else dagger.duration_s
     experts = flights if round_ == 0 else round(dagger.expert_flights * flights)
-    shards: list[list[PlannedFlight]] = [[]]
+    shards: list[list[tuple[Scenario, bool]]] = [[]]
     for number in range(flights):
         scenario = _draw_flight(data, duration_s, seed, first + number)
-        robots = sum(flight.scenario.robots for flight in shards[-1])
+        robots = sum(planned.robots for planned, _ in shards[-1])
         if shards[-1] and robots + scenario.robots > _ROBOTS_TOGETHER:
             shards.append([])
-        shards[-1].append(PlannedFlight(scenario, number < experts))
+        shards[-1].append((scenario, number < experts))
     return [
         PlannedShard(
             name=f"{round_:02d}-{number:04d}",
-            flights=tuple(shard),
+            scenarios=tuple(scenario for scenario, _ in shard),
+            by_expert=tuple(by_expert for _, by_expert in shard),
             times_s=_draw_times_s(data.states, duration_s, [seed, round_, number]),
             data=data,
         )
@@ -173,9 +168,8 @@ def fly_shard(task: ShardTask) -> FlownShard:
     """Fly it, in whatever process this is. Raises BundleError, ValueError."""
     shard, bundle, taught = task
     begun_s = time.process_time()
-    deciding = _Deciding([flight.by_expert for flight in shard.flights])
-    scenarios = [flight.scenario for flight in shard.flights]
-    flights = BatchedFlights(scenarios, bundle, agents=deciding.of)
+    deciding = _Deciding(shard.by_expert)
+    flights = BatchedFlights(shard.scenarios, bundle, agents=deciding.of)
     experts = [taught.teacher(shard.data, world) for world in flights.prepared]
     deciding.watch(flights, experts)
     looks_s = np.arange(0.0, max(shard.times_s), LOOK_PERIOD_S).tolist()

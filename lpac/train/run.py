@@ -114,8 +114,8 @@ class TrainingRun:
                 shard = missing[name]
                 facts = {
                     "seed": self._config.seed,
-                    "flights": len(shard.flights),
-                    "by_expert": sum(flight.by_expert for flight in shard.flights),
+                    "flights": len(shard.scenarios),
+                    "by_expert": sum(shard.by_expert),
                     "bundle_id": bundle.id if round_ else None,
                     "cpu_s": round(cpu_s, 3),
                     "versions": _versions(),
@@ -196,7 +196,7 @@ class TrainingRun:
         self._work.show("export", best.candidate.round)
         folder = self._of(best.candidate)
         judged = load_bundle(folder / _BUNDLE)
-        baselines = self._selection.baselines(folder / _BUNDLE, judged, pool)
+        baselines = self._selection.baselines(folder / _BUNDLE, pool)
         checkpoint = (folder / _CHECKPOINT).read_bytes()
         limit = _PAYLOAD_MARGIN * self._largest_payload(judged, pool)
         int8 = self._selection.with_payload("int8", folder / _BUNDLE, judged, pool)
@@ -247,14 +247,15 @@ class TrainingRun:
 
     def _largest_payload(self, bundle: Bundle, pool: Pool) -> float:
         """The largest number in a payload of the first flights of the data, flown by the policy."""
-        flights = [flight for shard in self._plans[0] for flight in shard.flights]
+        scenarios = [scenario for shard in self._plans[0] for scenario in shard.scenarios]
         shards = [
             replace(
                 self._plans[0][0],
-                flights=(flight._replace(by_expert=False),),
+                scenarios=(scenario,),
+                by_expert=(False,),
                 times_s=(self._config.data.duration_s,),
             )
-            for flight in flights[:_PAYLOAD_FLIGHTS]
+            for scenario in scenarios[:_PAYLOAD_FLIGHTS]
         ]
         tasks = [ShardTask(shard, bundle, self._network.task) for shard in shards]
         with closing(pool(fly_shard, tasks)) as outcomes:
@@ -262,11 +263,11 @@ class TrainingRun:
 
 
 def _robots(shard: PlannedShard) -> int:
-    return sum(flight.scenario.robots for flight in shard.flights)
+    return sum(scenario.robots for scenario in shard.scenarios)
 
 
 def _robot_seconds(shard: PlannedShard) -> float:
-    return sum(flight.scenario.robots * flight.scenario.duration_s for flight in shard.flights)
+    return sum(scenario.robots * scenario.duration_s for scenario in shard.scenarios)
 
 
 def _versions() -> dict[str, str]:

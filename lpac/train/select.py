@@ -11,10 +11,12 @@ import numpy as np
 from edge.core import F64
 from edge.core.wire import PayloadType
 from edge.policy.bundle import Bundle
-from lpac.evaluate.flights import POLICY, EvaluationFlight, Flier, KeptFlights, sizes_of
 from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Pool
 from lpac.sim.kept import KeptOutcomes
+from lpac.study.flights import KeptFlights, PlannedFlight
+from lpac.study.study import Condition, Method, Study, TrainedBundle
+from lpac.study.worlds import SET_UPS
 from lpac.train.config import SelectConfig
 from lpac.train.task import Task
 
@@ -60,28 +62,36 @@ def candidates_of(round_: int, epochs: int, every: int) -> list[Candidate]:
     return [Candidate(round_, epoch) for epoch in sorted({*range(every, epochs, every), epochs})]
 
 
+def policy_of(path: Path, bundle: Bundle) -> Method:
+    """The one that was trained."""
+    return Method(name="lpac", trainings=(TrainedBundle(str(path.resolve()), bundle.id),))
+
+
 def flights_of(
-    select: SelectConfig,
-    flier: Flier,
-    bundle: Path,
-    flown_by: str,
-    payload: PayloadType = "float16",
-) -> list[EvaluationFlight]:
-    """The flights by which one is judged: over validation worlds. Baselines lose no messages."""
+    select: SelectConfig, method: Method, sizes_from: Path, payload: PayloadType = "float16"
+) -> list[PlannedFlight]:
+    """The flights by which a policy is judged, or a baseline that has the sizes of a bundle.
+
+    They are over validation worlds. Baselines lose no messages.
+    """
+    study = Study(
+        methods=(method,),
+        conditions=tuple(
+            Condition(
+                scenario=SET_UPS[set_up].scenario(
+                    duration_s=select.duration_s, loss=select.loss, payload=payload
+                )
+            )
+            for set_up in select.set_ups
+        ),
+        worlds=select.worlds,
+        sizes_from=str(sizes_from.resolve()),
+    )
     return [
-        EvaluationFlight(
-            flier=flier,
-            bundle=str(bundle.resolve()),
-            flown_by=flown_by,
-            world_set="validation",
-            world=world,
-            set_up=set_up,
-            duration_s=select.duration_s,
-            loss=select.loss if flier == POLICY else 0.0,
-            payload=payload,
-        )
-        for set_up in select.set_ups
-        for world in range(select.worlds)
+        flight
+        for condition in study.conditions
+        for draw in study.draws
+        for flight in study.flights_of(method, condition, draw)
     ]
 
 
@@ -125,7 +135,7 @@ class Selection:
         if any(judged.candidate == candidate for judged in self.judged):
             return
         begun_s = time.monotonic()
-        costs = self._fly(flights_of(self._select, POLICY, path, bundle.id), pool, tell)
+        costs = self._fly(flights_of(self._select, policy_of(path, bundle), path), pool, tell)
         self._kept.add(
             {
                 "candidate": list(candidate),
@@ -135,17 +145,13 @@ class Selection:
             }
         )
 
-    def baselines(
-        self, path: Path, bundle: Bundle, pool: Pool
-    ) -> dict[BaselineName, ClosedLoopCost]:
-        """Over the same worlds, with the bundle's sizes."""
+    def baselines(self, path: Path, pool: Pool) -> dict[BaselineName, ClosedLoopCost]:
+        """Over the same worlds, with the sizes of the bundle at `path`."""
         names = self._task.baselines
         if not names:
             return {}
         flights = [
-            flight
-            for name in names
-            for flight in flights_of(self._select, name, path, sizes_of(bundle))
+            flight for name in names for flight in flights_of(self._select, Method.of(name), path)
         ]
         costs = self._fly(flights, pool, lambda _: None).reshape(len(names), -1)
         return {name: ClosedLoopCost.of(of) for name, of in zip(names, costs, strict=True)}
@@ -154,12 +160,12 @@ class Selection:
         self, payload: PayloadType, path: Path, bundle: Bundle, pool: Pool
     ) -> ClosedLoopCost:
         """The same flights, with messages that are encoded so."""
-        flights = flights_of(self._select, POLICY, path, bundle.id, payload)
+        flights = flights_of(self._select, policy_of(path, bundle), path, payload)
         return ClosedLoopCost.of(self._fly(flights, pool, lambda _: None))
 
-    def _fly(self, flights: list[EvaluationFlight], pool: Pool, tell: Callable[[int], None]) -> F64:
+    def _fly(self, flights: list[PlannedFlight], pool: Pool, tell: Callable[[int], None]) -> F64:
         """The cost of each at the end, over that at the start."""
-        flown: dict[EvaluationFlight, float] = {}
+        flown: dict[PlannedFlight, float] = {}
         with closing(self._flights.fly(flights, pool)) as outcomes:
             for flight, told in outcomes:
                 flown[flight] = told.cost[-1] / told.cost[0]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from edge.core import F64, Bools
-from lpac.evaluate.flights import EvaluationFlight, FlightGroup, FlownCost, costs_of
 from lpac.sim.baselines import BaselineName
 from lpac.sim.experiment import Preparation
+from lpac.study.flights import CostCurve, FlightGroup, PlannedFlight, curves_of
 from lpac.train.config import DataConfig
 from lpac.train.expert import Expert, make_expert
 
@@ -50,7 +50,7 @@ class Task(Protocol):
     def teacher(self, data: DataConfig, world: Preparation) -> Teacher:
         """A new one, for that world."""
 
-    def costs(self, flights: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
+    def costs(self, flights: FlightGroup) -> list[tuple[PlannedFlight, CostCurve]]:
         """Fly them; policies are chosen by the cost at the end over that at the start.
 
         Raises BundleError, ValueError, OSError.
@@ -83,6 +83,6 @@ class CoverageTask(NamedTuple):
         """The configured expert."""
         return make_expert(data, world)
 
-    def costs(self, flights: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
+    def costs(self, flights: FlightGroup) -> list[tuple[PlannedFlight, CostCurve]]:
         """The coverage cost."""
-        return costs_of(flights)
+        return curves_of(flights)

@@ -6,9 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64, Bools
-from lpac.evaluate.flights import EvaluationFlight, FlightGroup, FlownCost, fly_group
+from edge.core.frames import ModelScale
+from lpac.analysis.flight import FlightRecord
 from lpac.sim.baselines import BaselineName
-from lpac.sim.experiment import Preparation, SimulatedFlight
+from lpac.sim.experiment import Preparation
+from lpac.study.flights import CostCurve, FlightGroup, PlannedFlight, records_of
 from lpac.train.config import DataConfig
 from lpac_flocking.policy import away_from_close, place_in
 
@@ -82,7 +84,7 @@ class FlockingTask(NamedTuple):
         """See `lpac.train.task.Task`."""
         return FlockExpert(world.perception.world_size, world.bundle.manifest.training.max_speed)
 
-    def costs(self, flights: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
+    def costs(self, flights: FlightGroup) -> list[tuple[PlannedFlight, CostCurve]]:
         """Disagreement in the last half of the flight, over that of robots each on its own way.
 
         Those fly at the flock's speed in directions that have nothing to do with each other. A
@@ -90,21 +92,26 @@ class FlockingTask(NamedTuple):
         radius is more than half the world's, the cost is higher.
         """
         return [
-            (flight, FlownCost((0.0, flight.duration_s), (1.0, cost_of(flown))))
-            for flight, flown in fly_group(flights)
+            (
+                flight,
+                CostCurve((0.0, record.duration_s), (1.0, cost_of(record, flight.scenario.scale))),
+            )
+            for flight, record in records_of(flights)
         ]
 
 
-def cost_of(flown: SimulatedFlight) -> float:
+def cost_of(record: FlightRecord, scale: ModelScale) -> float:
     """See `FlockingTask.costs`."""
-    half = len(flown.time_s) // 2
-    scale = flown.scenario.scale
+    time_s = record.robots[0].time_s
+    positions_m = np.stack([robot.position_m[:, :2] for robot in record.robots], axis=1)
+    half = len(time_s) // 2
     cruise_m_s = _CRUISE * scale.velocity_scale
-    apart = disagreement_m_s(flown.time_s, flown.positions_m)[half:].mean() / cruise_m_s
-    speed = speed_m_s(flown.time_s, flown.positions_m)[half:].mean() / cruise_m_s
-    offsets_m = flown.positions_m - flown.positions_m.mean(axis=1, keepdims=True)
+    apart = disagreement_m_s(time_s, positions_m)[half:].mean() / cruise_m_s
+    speed = speed_m_s(time_s, positions_m)[half:].mean() / cruise_m_s
+    offsets_m = positions_m - positions_m.mean(axis=1, keepdims=True)
     radius = np.sqrt((offsets_m[half:] ** 2).sum(axis=2).mean())
-    world_m = flown.perception.world_size / scale.env_scale
+    assert record.coverage is not None
+    world_m = record.coverage.size_m
     return float(apart + max(0.0, 0.8 - speed) + max(0.0, 4.0 * radius / world_m - 1.0))
 
 

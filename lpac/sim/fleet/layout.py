@@ -50,23 +50,25 @@ def settings_of(scenario: Scenario) -> Settings:
         },
         "policy": {
             "max_message_age_s": scenario.max_message_age_s,
-            "max_input_age_s": scenario.max_input_age_s,
+            "max_input_age_s": scenario.input_age_s,
         },
         # PX4 obeys no other remote control.
         "failsafe": {"rc": "pilot"} if scenario.failures else {},
     }
 
 
-def _require_flyable(scenario: Scenario) -> None:
+def require_whole_robots(scenario: Scenario) -> None:
     """Raise ValueError for what whole robots cannot do."""
     scenario.require_default(
-        "whole robots", "controller", "scale", "max_speed_m_s", "position_bias", "lag_s", "payload",
-        "radio",
+        "whole robots", "controller", "scale", "max_speed_m_s", "position_bias",
+        "position_error_m", "lag_s", "payload", "radio",
     )  # fmt: skip
     if scenario.robots > MAX_ROBOTS:
         raise ValueError(f"robots = {scenario.robots}: must be from 1 to {MAX_ROBOTS}")
     if scenario.clocks.synchronous:
         raise ValueError("synchronous = True: must be False for whole robots")
+    if scenario.wind_m_s is not None and not scenario.errors:
+        raise ValueError(f"wind_m_s = {scenario.wind_m_s}: there is none without errors")
     for failure in scenario.failures:
         if not math.isfinite(failure.until_s):
             raise ValueError(f"robot {failure.robot} is lost: whole robots can only be away")
@@ -85,7 +87,7 @@ class Layout:
     ) -> None:
         """Raises ValueError if there is no room for so many robots; BundleError for a bundle that
         cannot be loaded, or has no perception."""
-        _require_flyable(scenario)
+        require_whole_robots(scenario)
         self.bundle, self.bundle_path = load_bundle(bundle_path), bundle_path.resolve()
         manifest, perception = self.bundle.manifest, scenario.perception_of(self.bundle)
         self._has_own_sizes = perception != manifest.perception
@@ -212,7 +214,7 @@ class Layout:
             north_m, east_m = self.to_world_m(pad_m)
             vehicle = Px4Vehicle(
                 seed=seed, start_m=(north_m, east_m), heading_rad=heading_rad, origin=WORLD,
-                errors=Errors(seed, self.scenario.seed) if self.scenario.errors else None,
+                errors=self._errors(seed),
             )  # fmt: skip
             if not self.scenario.errors:
                 vehicle.gps_bias_m = np.zeros(3)
@@ -220,6 +222,10 @@ class Layout:
                 vehicle.gps_told_m = min(GPS_ACCURACY_M[0], self.scenario.budget.gps_m / 2.0)
             vehicles.append(vehicle)
         return pads_m, pads_m + biases_m, tuple(vehicles)
+
+    def _errors(self, seed: int) -> Errors | None:
+        scenario = self.scenario
+        return Errors(seed, scenario.seed, scenario.wind_m_s) if scenario.errors else None
 
     def _draw_pads(self, biases_m: F64) -> F64:
         """Pads (N, 2) apart from each other, in truth and as robots with each (N, 2) see them."""

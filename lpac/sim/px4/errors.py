@@ -72,13 +72,15 @@ class Wave(NamedTuple):
 
 
 class Errors:
-    """How one vehicle errs. `fleet_seed` is the same for all that fly together.
+    """How one vehicle errs. `fleet_seed` and `mean_wind_m_s` are the same for all of a fleet.
+
+    The mean wind is drawn where it is None.
 
     `thrust_loss` is the share of its thrust that a weak motor costs it, 0 for most. `drain` is by
     how much sooner its pack is empty than a new one, `resistance_ohm` what makes its voltage sag.
     """
 
-    def __init__(self, seed: int, fleet_seed: int) -> None:
+    def __init__(self, seed: int, fleet_seed: int, mean_wind_m_s: float | None = None) -> None:
         own, common = np.random.default_rng([seed, 1]), np.random.default_rng([fleet_seed, 2])
         self._walk = [_draw_wave(own, _WALK_M, _WALK_PERIODS_S) for _ in range(2)]
         self._height = [_draw_wave(own, OWN_HEIGHT_M, _OWN_HEIGHT_PERIODS_S) for _ in range(2)]
@@ -94,7 +96,8 @@ class Errors:
 
         direction_rad = float(common.uniform(0.0, math.tau))
         self._wind_direction = math.cos(direction_rad), math.sin(direction_rad), 0.0
-        self._mean_wind_m_s = float(common.uniform(*_MEAN_WINDS_M_S))
+        drawn_m_s = float(common.uniform(*_MEAN_WINDS_M_S))
+        self._mean_wind_m_s = drawn_m_s if mean_wind_m_s is None else mean_wind_m_s
         self._gust_rad_s = math.tau / float(common.uniform(*_GUST_PERIODS_S))
 
         self.resistance_ohm = float(own.uniform(*_RESISTANCES_OHM))
@@ -180,7 +183,8 @@ class Errors:
     def wind_m_s(self, time_s: float) -> Vector:
         """Where the air goes, gusts and all; the same for the whole fleet."""
         gust = max(0.0, math.sin(self._gust_rad_s * time_s)) ** 3
-        speed_m_s = self._mean_wind_m_s + (GREATEST_WIND_M_S - self._mean_wind_m_s) * gust
+        gusts_m_s = max(0.0, GREATEST_WIND_M_S - self._mean_wind_m_s)
+        speed_m_s = self._mean_wind_m_s + gusts_m_s * gust
         return times(self._wind_direction, speed_m_s)
 
     def is_remote_control_stale(self, time_s: float) -> bool:

@@ -18,12 +18,14 @@ from edge.policy.bundle import load_bundle
 from lpac.analysis.logs import read_logs
 from lpac.analysis.truth import TRUTH, load_truth
 from lpac.cli.options import DEFAULT_BUNDLE
-from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, costs_of
 from lpac.sim.cluster import over_ray
 from lpac.sim.cores import over_cores
 from lpac.sim.drill.campaign import Campaign, FlightOutcome, fly_order
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.field import DrilledRobots
+from lpac.study.flights import KeptFlights, curves_of
+from lpac.study.study import Condition, Method, Study
+from lpac.study.worlds import FIELD
 from lpac.train.rollout import ShardTask, fly_shard, plan_round
 from tests.command import called, error_line
 from tests.conftest import SHIPPED
@@ -76,17 +78,11 @@ def test_a_cluster_of_two_nodes_flies_the_same(
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_an_evaluation_over_a_cluster_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
-    bundle_id = load_bundle(DEFAULT_BUNDLE).id
-    flights = [
-        EvaluationFlight(
-            flier=flier, bundle=str(DEFAULT_BUNDLE), flown_by=bundle_id, world_set="validation",
-            world=0, set_up="field", duration_s=1.0,
-        )
-        for flier in (POLICY, LLOYD)
-    ]  # fmt: skip
-    flown = dict(KeptFlights(tmp_path).fly(flights, over_ray(cluster.address)))
-    assert flown == dict(pair for flight in flights for pair in costs_of((flight,)))
+def test_a_study_over_a_cluster_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
+    condition = Condition(scenario=FIELD.scenario(duration_s=1.0))
+    study = Study(methods=(Method.of("field", SHIPPED),), conditions=(condition,), worlds=1)
+    flown = dict(KeptFlights(tmp_path).fly(study.flights(), over_ray(cluster.address)))
+    assert flown == dict(pair for flight in study.flights() for pair in curves_of((flight,)))
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")

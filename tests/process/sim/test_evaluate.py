@@ -7,19 +7,19 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from edge.policy.bundle import load_bundle
 from lpac.analysis.statistics import VERDICT_RULE
-from lpac.cli.evaluate import _show as show_evaluation
 from lpac.cli.options import DEFAULT_BUNDLE
-from lpac.evaluate.flights import POLICY, EvaluationFlight, costs_of
 from lpac.radio.records import RadioRecord, write_records
 from lpac.sim.ticks import Clocks
+from lpac.study.flights import curves_of
+from lpac.study.study import Condition, Draw, Method, Study
+from lpac.study.summary import LEGEND, tables_of
+from lpac.study.worlds import SET_UPS
 from tests.command import called, error_line, lpac
 
 PLAIN = ("-k", 2, "--duration", 2, "--baseline", "decentralized-cvt-prior")
@@ -42,7 +42,7 @@ def test_it_tells_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     assert json.loads((out / "evaluation.json").read_text()) == told
     assert told["world_set"] == "validation" and told["test_set_opened"] is None
     plain, lossy, lost, int8, int8_lossy = told["conditions"]
-    assert (lossy["loss"], lost["lost_robots"], lost["lost_at_s"]) == (0.3, 2, 1.0)
+    assert (lossy["scenario"]["loss"], lost["lost_robots"], lost["lost_at_s"]) == (0.3, 2, 1.0)
     for condition in told["conditions"]:
         names = [result["name"] for result in condition["results"]]
         assert names == [DEFAULT_BUNDLE.name, "decentralized-cvt-prior", "clairvoyant-cvt"]
@@ -50,7 +50,8 @@ def test_it_tells_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     assert 0.0 < clairvoyant["final"]["mean"][0] < policy["final"]["mean"][0] < 1.0
     assert clairvoyant["over_clairvoyant"]["ratio_of_means"] == [1.0, 1.0, 1.0]
     assert all(ratio > 1.0 for [ratio] in zip(*policy["by_world"]["over_best_of_ten"], strict=True))
-    payloads = [(condition["payload"], condition["loss"]) for condition in (int8, int8_lossy)]
+    told_of = [condition["scenario"] for condition in (int8, int8_lossy)]
+    payloads = [(scenario["payload"], scenario["loss"]) for scenario in told_of]
     assert payloads == [("int8", 0.0), ("int8", 0.3)]
     coarse = int8["results"][0]["final"]["mean"][0]
     assert 0.0 < abs(coarse - policy["final"]["mean"][0]) < 0.05 and int8["results"][1] == prior
@@ -60,19 +61,19 @@ def test_it_tells_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
 
 
 def test_it_says_what_its_columns_are_and_how_many_worlds_would_tell(
-    evaluated: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
+    evaluated: tuple[Path, dict[str, Any]],
 ) -> None:
-    plain = {**evaluated[1], "conditions": evaluated[1]["conditions"][:1]}
-    show_evaluation(plain, compared=False)
-    said = capsys.readouterr().out
+    out, told = evaluated
+    readme = (out / "README.md").read_text()
     for column in ("J / J(0)", "p90", "worst", "area", "vs clairvoyant", "vs best Lloyd"):
-        assert f"{column}: " in said
-    assert VERDICT_RULE in said and "not told apart" in said and "undecided" not in said
+        assert f"{column}: " in LEGEND
+    assert VERDICT_RULE in LEGEND and all(line in readme for line in LEGEND.splitlines())
+    assert "not told apart" in readme and "undecided" not in readme
+    plain = {**told, "conditions": told["conditions"][:1]}
     policy, prior, _ = plain["conditions"][0]["results"]
     plain["conditions"] = [{**plain["conditions"][0], "compared": policy["against"][prior["name"]]}]
-    plain["methods"] = [plain["methods"][0], {"name": prior["name"], "bundles": []}]
-    show_evaluation(plain, compared=True)
-    assert "2 worlds are too few to tell: at least 6" in capsys.readouterr().out
+    [compared, _] = tables_of(plain)
+    assert "2 worlds are too few to tell: at least 6" in compared.note
 
 
 def test_it_draws_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
@@ -98,12 +99,12 @@ def test_with_the_radio_that_a_field_had(tmp_path: Path) -> None:
         "multicast", "--wifi", records, "--out", tmp_path)  # fmt: skip
     result = called("evaluate", *options)
     assert result.returncode == 0, result.stderr
-    assert "field, multicast by the model: 1 worlds" in result.stdout
+    assert "field, multicast by the model: 1 world of the validation set" in result.stdout
     assert "data_rate_mbit_s = 100  # from the radios' rates, 1 record\n" in result.stdout
     told = json.loads((tmp_path / "evaluation.json").read_text())
     ideal, modelled = told["conditions"]
-    assert ideal["radio_model"] is None
-    assert modelled["radio_model"]["loss"] > 0.2
+    assert ideal["scenario"]["radio"] is None
+    assert modelled["scenario"]["link"]["loss"] > 0.2
     assert modelled["results"][0] != ideal["results"][0]
     assert modelled["results"][1] == ideal["results"][1]
     assert told["wifi_from"]["frame_loss"] == {"kind": "delivered", "records": 1}
@@ -121,18 +122,20 @@ def test_killed_and_with_a_full_disk_it_loses_nothing_and_goes_on(
             assert killed.poll() is None
             time.sleep(0.02)
         killed.send_signal(signal.SIGKILL)
-    before = kept.read_text().splitlines()[:1]
-    # As if it was killed in the middle of a line.
+    # A flight of somebody else's study; and as if it was killed in the middle of a line.
+    other = {"flight": "other", "seed": 0, "time_s": [0.0] * 20_000, "cost": [], "lloyd": None}
+    before = [*kept.read_text().splitlines()[:1], json.dumps(other)]
     kept.write_text("\n".join([*before, '{"flight": "lpa']))
 
     def limit() -> None:
         """Files may not grow past some flights of these; the tasks have room."""
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2500, 2500))
+        most = kept.stat().st_size + 1000
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
 
     full = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit)
     assert error_line(full) == "lpac: [Errno 27] File too large"
-    before = [*before, *kept.read_text().splitlines()[1:-1]]
-    assert len(before) > 1
+    before = [*before, *kept.read_text().splitlines()[2:-1]]
+    assert len(before) > 2
     result = called("evaluate", *PLAIN, "--out", tmp_path, "--json")
     assert result.returncode == 0, (result.stdout, result.stderr)
     assert kept.read_text().splitlines()[: len(before)] == before
@@ -184,18 +187,18 @@ def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.real_time
 def test_a_program_for_each_robot_flies_what_whole_robots_do() -> None:
     """Over the same world from the same pad, with its timing's rates."""
-    clocked = EvaluationFlight(
-        flier=POLICY,
-        bundle=str(DEFAULT_BUNDLE),
-        flown_by=load_bundle(DEFAULT_BUNDLE).id,
-        world_set="validation",
-        world=0,
-        set_up="n1",
-        duration_s=4.0,
-        clocks=Clocks(perception_s=0.4),
-        robot="simulated",
+    scenario = SET_UPS["n1"].scenario(duration_s=4.0, clocks=Clocks(perception_s=0.4))
+    conditions = (
+        Condition(scenario=scenario, engine="simulated"),
+        Condition(scenario=scenario, engine="mavlink"),
     )
-    of_both = costs_of((clocked,)) + costs_of((replace(clocked, robot="mavlink"),))
+    study = Study(methods=(Method.of("field", DEFAULT_BUNDLE),), conditions=conditions, worlds=1)
+    of_both = [
+        pair
+        for condition in conditions
+        for flight in study.flights_of(study.methods[0], condition, Draw(0))
+        for pair in curves_of((flight,))
+    ]
     (_, on_a_clock), (_, in_real_time) = of_both
     assert on_a_clock.time_s == in_real_time.time_s == (0.0, 1.0, 2.0, 3.0, 4.0)
     # Receivers err alike in both; who has taken off has drifted by some metres.

@@ -23,13 +23,13 @@ from edge.messages.mission import FlightState
 from edge.robot.config import load_config
 from lpac.fleet.settings import load_fleet
 from lpac.ground.station.config import load_ground
-from lpac.paper.experiments import absences_of
-from lpac.paper.flown import fly_programs
 from lpac.sim.description import ERRORS
+from lpac.sim.engines import engine_of
 from lpac.sim.failure import Failure
 from lpac.sim.fleet.listener import FleetListener
 from lpac.sim.fleet.processes import Fleet, SimulatedFleetError
 from lpac.sim.scenario import Scenario
+from lpac.study.perturbation import absences_of
 from tests.command import error_line, lpac
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE
@@ -218,7 +218,7 @@ def test_a_pilot_takes_a_robot_out_of_the_fence_and_back(tmp_path: Path) -> None
         robots=2, seed=3, duration_s=22.0, secure=True, transport="router", budget=PRECISE,
         failures=(taken,),
     )  # fmt: skip
-    record = fly_programs(scenario, tmp_path, SHIPPED)
+    [record] = engine_of("mavlink").fly([scenario], SHIPPED, tmp_path)
     [absence] = absences_of(record)
     assert absence.robot == "r0"
     assert np.allclose((absence.from_s, absence.until_s), (taken.from_s, taken.until_s), atol=3.0)

@@ -8,32 +8,38 @@ import pytest
 from edge.policy.bundle import load_bundle
 from lpac.cli.options import DEFAULT_BUNDLE
 from tests.command import called, error_line, lpac
+from tests.conftest import ROOT
+
+STUDIES = ROOT / "lpac" / "paper" / "studies"
 
 
 def test_rates_and_asynchrony_are_flown_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In this process, over its cores; for as long as it takes to cover."""
-    for module in ("asynchrony", "asynchrony_report"):
-        monkeypatch.setattr(f"lpac.paper.{module}.TIMES_S", (5.0, 10.0, 20.0))
-    command = ("paper", "async", "--quick", "-k", 1, "--out", tmp_path, "--json")
+    for name in ("async", "async-quick"):
+        text = (STUDIES / f"{name}.toml").read_text()
+        (tmp_path / f"{name}.toml").write_text(f"{text}\n[scenario]\nduration_s = 20.0\n")
+    monkeypatch.setattr("lpac.paper.experiments._STUDIES", tmp_path)
+    out = tmp_path / "out"
+    command = ("paper", "async", "--quick", "-k", 1, "--out", out, "--json")
     result = called(*command)
     assert result.returncode == 0, (result.stdout, result.stderr)
     told = json.loads(result.stdout)
-    assert told["bundle_id"] == load_bundle(DEFAULT_BUNDLE).id and told["worlds"] == 1
+    assert told["made_by"]["bundle"] == load_bundle(DEFAULT_BUNDLE).id and told["worlds"] == 1
     field, *others = told["timings"]
     assert (field["perception_hz"], field["policy_hz"], field["synchronous"]) == (5.0, 2.5, False)
-    assert field["over_field"] == [[1.0, 1.0, 1.0]] * 3
+    assert field["over_field"] == [[1.0, 1.0, 1.0]] * 3 and told["times_s"] == [5.0, 10.0, 20.0]
     # It covers, and what is another timing is another flight.
     [[_, _, end]] = field["by_world"]
     assert 0.0 < end < 0.5
     ends = {tuple(timing["by_world"][0]) for timing in told["timings"]}
     assert len(ends) == 1 + len(others) == 13
-    assert (tmp_path / "rates.png").exists() and (tmp_path / "README.md").exists()
+    assert (out / "rates.png").exists() and (out / "README.md").exists()
     # What was flown is kept: a world more is all that is flown then.
-    flown = (tmp_path / "flights.jsonl").read_bytes()
+    flown = (out / "flights.jsonl").read_bytes()
     assert called(*command).stdout == result.stdout
-    assert (tmp_path / "flights.jsonl").read_bytes() == flown
+    assert (out / "flights.jsonl").read_bytes() == flown
 
 
 def test_trials_are_flown_over_cores(tmp_path: Path) -> None:
@@ -46,8 +52,8 @@ def test_trials_are_flown_over_cores(tmp_path: Path) -> None:
     made_by = told["made_by"]
     assert made_by["bundle"] == load_bundle(DEFAULT_BUNDLE).id
     # Nothing in it is of this machine alone.
-    assert made_by["command"] == "lpac paper e2 --trials 2 --world 0"
-    assert made_by["seeds"].startswith("trial 1 ") and "numpy" in made_by
+    assert made_by["command"] == "lpac paper e2 --trials 2"
+    assert made_by["worlds"].startswith("0 to 0 of the validation") and "numpy" in made_by
     assert (tmp_path / "repeatability.png").exists() and (tmp_path / "README.md").exists()
 
 
@@ -57,7 +63,8 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     assert "absent" in error_line(called("paper", "async", "--bundle", "absent"))
     assert error_line(called("paper", "e2", "--trials", 1)).startswith("lpac: --trials 1: must be")
     assert (
-        error_line(called("paper", "e3", "--world", -1)) == "lpac: world = -1: must be at least 0"
+        error_line(called("paper", "e3", "--world", -1))
+        == "lpac: first_world = -1: must be at least 0"
     )
     no_build = called("paper", "e3", "--vehicle", "px4", "--out", tmp_path)
     assert error_line(no_build) == "lpac: --vehicle px4 needs --px4 with PX4's build folder"

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lpac.paper.experiments import absences_of, perturbed_by
 from lpac.sim.failure import Failure
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.scenario import Scenario
+from lpac.study.perturbation import absences_of, perturbed_by
 from tests.conftest import SHIPPED
 
 

@@ -1,4 +1,4 @@
-"""An evaluation's flights with the reference library in the loop: its world, sensors and cost."""
+"""A study's flights with the reference library in the loop: its world, sensors and cost."""
 
 from typing import Any
 
@@ -10,10 +10,11 @@ from edge.core.ports import OdometrySource
 from edge.core.world import GaussianFeature
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import load_bundle
-from lpac.evaluate.flights import EvaluationFlight, fly_group
-from lpac.sim.experiment import SimulatedFlight, prepare
+from lpac.sim.experiment import SimulatedFlight, fly, prepare
 from lpac.sim.swarm import ClockedPac, Swarm
 from lpac.sim.vehicles import PointVehicles
+from lpac.study.study import Condition, Draw, Method, Study
+from lpac.study.worlds import FIELD as SET_UP
 from tests.conftest import ROOT
 from tests.unit.core.reference import point_vector, reference_environment
 
@@ -84,17 +85,10 @@ def test_the_library_sees_about_the_same_flight() -> None:
     them by up to 0.09 of the first cost at some time, and by 0.025 at the end (on average 0.286
     here and 0.290 there). Flights that had nothing in common would by 0.3.
     """
-    flight = EvaluationFlight(
-        flier="lpac",
-        bundle=str(FIELD),
-        flown_by=load_bundle(FIELD).id,
-        world_set="validation",
-        world=102,
-        set_up="field",
-        duration_s=60.0,
-        loss=0.3,
-    )
-    [(_, flown)] = fly_group((flight,))
+    condition = Condition(scenario=SET_UP.scenario(loss=0.3))
+    study = Study(methods=(Method.of("field", FIELD),), conditions=(condition,))
+    [flight] = study.flights_of(study.methods[0], condition, Draw(102))
+    flown = fly(flight.scenario, load_bundle(FIELD))
     costs = flown_in_the_library(flown)
     np.testing.assert_allclose(flown.cost[0], costs[0], rtol=1e-3)
     apart = np.abs(flown.normalized_cost - costs / costs[0])

@@ -60,8 +60,8 @@ def test_what_it_means(tmp_path: Path) -> None:
             # The rest of a table that is changed stays.
             assert config.data.disturbances.lag_s == (0.0, 0.5)
             assert tomllib.loads(training.read.text)["data"]["worlds"][0]["robots"] == [2, 3]
-    assert base.flown_as.loss == slow.flown_as.loss == 0.1
-    assert slow.flown_as.clocks == Clocks(perception_s=0.4, policy_s=0.8)
+    assert base.condition.scenario.loss == slow.condition.scenario.loss == 0.1
+    assert slow.condition.scenario.clocks == Clocks(perception_s=0.4, policy_s=0.8)
     # Behind the two that weights are chosen by.
     assert ablation.worlds == range(2, 8)
     opened = read_ablation(written(tmp_path, ("worlds = 6", 'worlds = 6\nworld_set = "test"')))
@@ -88,7 +88,7 @@ def test_whatever_a_configuration_says_is_what_the_training_is_told(tmp_path: Pa
         ('"n3"', '"n4"', "set_up = 'n4': allowed are field, n1, n3, "),
         ("duration_s = 1.0", "duration_s = 0.5", "duration_s = 0.5: must be from 1 to 3600"),
         ("fly.loss = 0.1", "fly.loss = 2.0", "base: fly: loss = 2.0: must be from 0 to 1"),
-        ("fly.loss = 0.1", "fly.delay = 2.0", "base: fly: unknown key 'delay'; known are loss, "),
+        ("fly.loss = 0.1", "fly.delay = 2.0", "base: fly: unknown key 'delay'; known are "),
         ('"slow"', '"no-features"', "name = 'no-features': must be one variant's alone"),
         ('"slow"', '"base"', r"variants\[1\]: name = 'base': is what the variants are held"),
         ('"slow"', '"a/b"', r"variants\[1\]: name = 'a/b': must be letters, digits"),

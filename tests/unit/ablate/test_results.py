@@ -6,9 +6,11 @@ import pytest
 
 from lpac.ablate.config import Ablation, read_ablation
 from lpac.ablate.report import no_claim
-from lpac.ablate.results import VariantResult, flights_of, results_of
-from lpac.evaluate.evaluation import TrainedBundle
-from lpac.evaluate.flights import FlownCost
+from lpac.ablate.results import VariantResult, results_of, study_of
+from lpac.study.flights import CostCurve
+from lpac.study.results import results_of as results_of_study
+from lpac.study.study import TrainedBundle
+from tests.conftest import SHIPPED
 from tests.unit.ablate.test_config import written
 
 SEEDS = ("[0, 4]", "[0, 1, 2]")
@@ -16,16 +18,16 @@ SEEDS = ("[0, 4]", "[0, 1, 2]")
 
 def results(ablation: Ablation, ends: dict[str, list[float]]) -> list[VariantResult]:
     """If each variant's trainings end there, of 200 at the start; worlds differ more than they."""
-    bundles = {each.name: TrainedBundle(each.name, each.name) for each in ablation.trainings}
-    costs = {
-        flight: FlownCost((0.0, 1.0), (200.0, end + 20.0 * flight.world))
-        for variant in ablation.variants
-        for of_training, end in zip(
-            flights_of(ablation, variant, bundles), ends[variant.name], strict=True
-        )
-        for flight in of_training
-    }
-    return results_of(ablation, bundles, costs)
+    bundles = {each.name: TrainedBundle(str(SHIPPED), each.name) for each in ablation.trainings}
+    study = study_of(ablation, bundles)
+    curves = {flight: CostCurve((0.0, 1.0), (200.0, 0.0), 0.0) for flight in study.flights()}
+    for variant, condition in zip(ablation.variants, study.conditions, strict=True):
+        policy, _ = study.methods_of(condition)
+        for draw in study.draws:
+            flights = study.flights_of(policy, condition, draw)
+            for flight, end in zip(flights, ends[variant.name], strict=True):
+                curves[flight] = CostCurve((0.0, 1.0), (200.0, end + 20.0 * draw.world))
+    return results_of(ablation, results_of_study(study, curves))
 
 
 def test_who_is_better_and_by_how_much(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_what_comes_of_it(ablated: tuple[Path, list[AblationProgress]]) -> None:
 
 def test_how_far_it_is(ablated: tuple[Path, list[AblationProgress]]) -> None:
     _, told = ablated
-    assert told[0].doing == "base-0, 1 of 4 trainings" and told[-1].doing == "flight 36 of 36"
+    assert told[0].doing == "base-0, 1 of 4 trainings" and told[-1].doing == "flight 42 of 42"
     shares = [now.done for now in told]
     assert shares == sorted(shares) and shares[-1] == 1.0
     left_s = [now.left_s for now in told if now.left_s is not None]
@@ -86,7 +86,7 @@ def test_stopped_it_goes_on_and_comes_to_the_same(
 ) -> None:
     """In the second training, in the last, and among the flights."""
     ablation, folder = read_ablation(written(tmp_path)), tmp_path / "run"
-    for doing in ("base-4, 2", "no-features-4, 4", "flight 7 of 36"):
+    for doing in ("base-4, 2", "no-features-4, 4", "flight 7 of 42"):
 
         def stop(now: AblationProgress, doing: str = doing) -> None:
             if now.doing.startswith(doing):
@@ -99,10 +99,10 @@ def test_stopped_it_goes_on_and_comes_to_the_same(
     told: list[AblationProgress] = []
     ablate(ablation, folder, told.append)
     # Nothing that was done is done again.
-    assert told[0].doing == "flight 1 of 36"
+    assert told[0].doing == "flight 1 of 42"
     assert done == {path: path.stat().st_mtime_ns for path in folder.glob("*/*/bundle.id")}
     flown = (folder / "flights.jsonl").read_text().splitlines()[1:]
-    assert len({json.loads(line)["flight"] for line in flown}) == len(flown) == 36
+    assert len({json.loads(line)["flight"] for line in flown}) == len(flown) == 42
     for name in ("ablation.json", "README.md"):
         assert (folder / name).read_bytes() == (ablated[0] / name).read_bytes()
 

@@ -105,7 +105,7 @@ def test_ctrl_c_says_whether_the_same_command_goes_on(
 def test_a_missing_file_is_told_before_what_is_slow_is_loaded(
     command: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("torch", "lpac.evaluate.report", "lpac.evaluate.figures", "lpac.train.run"):
+    for module in ("torch", "lpac.study.summary", "lpac.study.figures", "lpac.train.run"):
         monkeypatch.setitem(sys.modules, module, None)
     missing = CliRunner().invoke(app, command).exception
     assert isinstance(missing, OSError | ValueError), missing

@@ -12,7 +12,7 @@ from tests.conftest import SHIPPED
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["sim", "--robots", "0"], "--robots 0: must be at least 1"),
+        (["sim", "--robots", "0"], "--robots 0: must be from 1 to"),
         (["sim", "--seed", "-1"], "--seed -1: must be at least 0"),
         (["sim", "--world", "docs/demo.png"], "docs/demo.png: is not a text file"),
         (["sim", "--out", "README.md"], "README.md"),
@@ -28,7 +28,7 @@ from tests.conftest import SHIPPED
         (["sim", "--starts", "Makefile"], "Makefile: line 1: must be 'x y', in m"),
         (["sim", "--starts", "/dev/null"], "/dev/null: has 0 starts, and there are 10 robots"),
         (["sim", "--policy-hz", "0"], "--policy-hz 0: must be from 0.1 to 100"),
-        (["sim", "--position-error", "-1"], "--position-error -1: must be at least 0"),
+        (["sim", "--position-error", "-1"], "--position-error -1.0: must be at least 0"),
         (["sim", "--lost", "10@5"], "lost robots 10@5: must be fewer than the team's 10"),
         (["sim", "--lost", "2@60"], "robot 8 is gone from 60 s on: must be within the flight"),
         (["sim", "--range", "0"], "--range 0.0: must be above 0 and finite"),

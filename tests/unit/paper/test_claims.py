@@ -20,8 +20,8 @@ from lpac.paper.claims import (
     claims_of,
     printed_rotation,
 )
-from lpac.paper.experiments import WHOLE_ROBOTS
 from lpac.paper.repeated import CHAPTERS, effort_of, sizes_of, write_page
+from lpac.study.summary import WHOLE_ROBOTS
 
 TIME_S = [float(t) for t in range(61)]
 FALLS = [0.2 + 0.8 * math.exp(-t / 8.0) for t in TIME_S]
@@ -38,15 +38,15 @@ def of_worlds(*costs: list[float]) -> dict[str, Any]:
         f"world {n}": {"lpac": flight(cost), "clairvoyant-cvt": flight(FALLS)}
         for n, cost in enumerate(costs)
     }
-    return {"worlds": worlds}
+    return {"flights": worlds}
 
 
 def of_whole_robots(cost: list[float]) -> dict[str, Any]:
     """Beside points that come down in time."""
     return {
-        "worlds": {
+        "flights": {
             name: {WHOLE_ROBOTS: flight(cost), **points}
-            for name, points in of_worlds(FALLS)["worlds"].items()
+            for name, points in of_worlds(FALLS)["flights"].items()
         }
     }
 
@@ -57,7 +57,7 @@ def repeated(deviation: float) -> dict[str, Any]:
         "largest_deviation_in_flight": 0.1, "mean_scatter_of_ends_m": 1.5,
     }  # fmt: skip
     return {
-        "trials": {"1": {}, "2": {}}, "spread": spread,
+        "trials": {"1": {}, "2": {}}, "looked_at_s": 40.0, "spread": spread,
         "mission_from_s": {"1": 28.0, "2": 27.0}, "mission_final": {"1": 0.2, "2": 0.3},
     }  # fmt: skip
 
@@ -81,7 +81,7 @@ def rates(together: float, slow: float, fast: float) -> dict[str, Any]:
         }  # fmt: skip
 
     timings = [timing(2.5, 1.0), timing(2.5, together, True), timing(0.5, slow), timing(10.0, fast)]
-    return {"worlds": 4, "timings": timings}
+    return {"worlds": 4, "times_s": [15.0, 30.0, 60.0], "timings": timings}
 
 
 def measured(where: str, zenoh: float, dds: float) -> dict[str, Any]:
@@ -239,17 +239,19 @@ def test_what_was_made_is_not_made_again(
     }  # fmt: skip
     asked: list[str] = []
 
-    def make(name: str) -> Any:
-        def made(*, out: Path, **_: object) -> None:
-            asked.append(name)
-            out.mkdir(parents=True, exist_ok=True)
-            (out / f"{name}.json").write_text(json.dumps({**documents[name], "flown": "Not."}))
+    def make(name: str, out: Path) -> None:
+        asked.append(name)
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{name}.json").write_text(json.dumps({**documents[name], "flown": "Not."}))
 
-        return made
+    def experiment(
+        name: str, flown: lpac.cli.paper.ExperimentOptions, _: object, *, quick: bool
+    ) -> None:
+        assert flown.out is not None
+        make(name, flown.out)
 
-    for chapter in CHAPTERS:
-        function = "asynchrony" if chapter.name == "async" else chapter.name
-        monkeypatch.setattr(lpac.cli.paper, function, make(chapter.name))
+    monkeypatch.setattr(lpac.cli.paper, "_experiment", experiment)
+    monkeypatch.setattr(lpac.cli.paper, "network", lambda *, out, **_: make("network", out))
     lpac.cli.paper.everything(quick=True, out=tmp_path)
     assert sorted(asked) == sorted(documents)
     lpac.cli.paper.everything(quick=True, out=tmp_path)

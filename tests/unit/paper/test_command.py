@@ -19,10 +19,11 @@ from lpac.analysis.flight import FlightRecord
 from lpac.analysis.logs import LoggedStatus, LoopRates
 from lpac.cli.options import DEFAULT_BUNDLE, VehicleKind
 from lpac.cli.paper import asynchrony, e1, e2, e3, transfer
-from lpac.evaluate.flights import BASELINES
-from lpac.paper.report import LOGS, write_network, write_transfer
+from lpac.paper.logged import LOGS
+from lpac.paper.network import network_report
 from lpac.sim.experiment import fly
 from lpac.sim.scenario import Scenario
+from lpac.study.study import BASELINES
 
 pytestmark = pytest.mark.usefixtures("sketched")
 
@@ -91,7 +92,7 @@ def test_a_logged_flight_is_held_against_baselines_from_where_it_began(
 ) -> None:
     e1(logs=tmp_path, trial=["paper-1"], out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
-    [of_world] = told["worlds"].values()
+    [of_world] = told["flights"].values()
     assert list(of_world) == ["flight", *BASELINES]
     flown = of_world["flight"]
     assert flown["final"] == pytest.approx(mission.normalized[-1])
@@ -115,7 +116,7 @@ def test_a_logged_flight_of_another_policy_has_no_baselines(
     monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
     e1(logs=tmp_path, out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
-    assert [list(of_world) for of_world in told["worlds"].values()] == [["flight"]]
+    assert [list(of_world) for of_world in told["flights"].values()] == [["flight"]]
     assert told["flown"] == LOGS
     assert "give the bundle that flew with --bundle" in capsys.readouterr().err
 
@@ -135,7 +136,7 @@ def test_of_a_day_with_two_policies_each_mission_is_looked_at_by_itself(
     monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
     e1(logs=tmp_path, out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
-    assert [len(of_world) for of_world in told["worlds"].values()] == [1, 1 + len(BASELINES)]
+    assert [len(of_world) for of_world in told["flights"].values()] == [1, 1 + len(BASELINES)]
     assert "is not what flew paper-0," in capsys.readouterr().err
     # Who did not fly has an empty cell.
     assert "|  |  |" in (tmp_path / "README.md").read_text()
@@ -177,7 +178,7 @@ def test_missions_are_put_together_by_their_rates(
     assert [(of["policy_hz"], of["over"]) for of in told["timings"]] == [
         (2.5, ["paper-1"]), (1.0, ["paper-2"]),
     ]  # fmt: skip
-    assert told["robot"] == "logs" and told["timings"][1]["over_field"][-1] == [1.0, 1.0, 1.0]
+    assert told["timings"][1]["over_field"][-1] == [1.0, 1.0, 1.0]
     assert told["made_by"]["command"] == "lpac paper async --logs 'day 1'"
 
 
@@ -186,14 +187,15 @@ def test_missions_are_put_together_by_their_teams(mission: FlightRecord, tmp_pat
     transfer(logs=Path("day 1"), trial=["paper-1"], out=tmp_path)
     told = json.loads((tmp_path / "transfer.json").read_text())
     [condition] = told["conditions"]
-    assert condition["name"] == "2 robots, 10 features" and told["duration_s"] == 5.0
+    assert condition["name"] == "2 robots, 10 features"
+    assert condition["scenario"]["duration_s"] == 5.0
     policy, clairvoyant = condition["results"]
     assert policy["final"]["mean"][0] == pytest.approx(mission.normalized[-1])
     assert clairvoyant["over_clairvoyant"]["ratio_of_means"][0] == 1.0
     over = policy["over_clairvoyant"]["ratio_of_means"][0]
     assert over == pytest.approx(policy["final"]["mean"][0] / clairvoyant["final"]["mean"][0])
     assert told["made_by"]["command"] == "lpac paper transfer --logs 'day 1' --trial paper-1"
-    assert "of each team's missions" in (tmp_path / "README.md").read_text()
+    assert "all missions of such a team" in (tmp_path / "README.md").read_text()
     assert (tmp_path / "2-robots-10-features" / "curves.png").exists()
     with pytest.raises(ValueError, match="give --bundle once"):
         transfer(logs=tmp_path, bundles=[DEFAULT_BUNDLE, DEFAULT_BUNDLE], out=tmp_path / "out")
@@ -222,43 +224,16 @@ def test_neighbours_are_those_in_range_of_the_policy_that_flew(
         ({"vehicle": VehicleKind.PX4}, "--vehicle px4 needs --px4"),
         ({"trial": ["a"]}, "--trial does nothing without --logs"),
         ({"world_file": Path("a.env")}, "--world-file does nothing without --logs"),
-        ({"bundle": Path("absent")}, "absent: "),
+        ({"bundles": [Path("absent")]}, "absent"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_no_folder(
     options: dict[str, Any], problem: str, tmp_path: Path
 ) -> None:
     for command in (e1, e2, e3, asynchrony, transfer):
-        its = dict(options)
-        if command is transfer and "bundle" in its:
-            its["bundles"] = [its.pop("bundle")]
         with pytest.raises((ValueError, OSError), match=problem):
-            command(**its, out=tmp_path / "out")
+            command(**options, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_an_evaluation_gets_its_table_and_what_made_it(tmp_path: Path) -> None:
-    by_world = {"final": [[0.3, 0.4]], "over_clairvoyant": [[1.0, 1.2]]}
-    over = {"ratio_of_means": [1.1, 1.0, 1.2]}
-    result = {"final": {"mean": [0.35, 0.3, 0.4]}, "over_clairvoyant": over, "by_world": by_world}
-    told = {
-        "world_set": "validation", "worlds": 2, "duration_s": 60.0,
-        "methods": [{"name": "field", "bundles": [{}]}, {"name": "lloyd", "bundles": []}],
-        "conditions": [
-            {"name": "n3", "results": [{"name": n, **result} for n in ("field", "lloyd")]}
-        ],
-    }  # fmt: skip
-    document = write_transfer(told, tmp_path, MADE_BY)
-    assert document == {**told, "flown": document["flown"], "made_by": MADE_BY}
-    rows = list(csv.DictReader((tmp_path / "transfer.csv").read_text().splitlines()))
-    assert len(rows) == 4
-    assert (rows[1]["method"], rows[1]["world"], rows[1]["cost_over_first"]) == (
-        "field",
-        "1",
-        "0.4",
-    )
-    text = (tmp_path / "README.md").read_text()
-    assert "| n3 | 0.350 (x 1.10, 1.00 to 1.20) |" in text and "`lpac paper ...`" in text
 
 
 def test_a_measured_network_gets_its_table_and_what_made_it(tmp_path: Path) -> None:
@@ -275,7 +250,7 @@ def test_a_measured_network_gets_its_table_and_what_made_it(tmp_path: Path) -> N
         ],
         "runs": [run],
     }  # fmt: skip
-    document = write_network(told, tmp_path, MADE_BY)
+    document = network_report(told, MADE_BY).write(tmp_path)
     assert "between network namespaces (drone0, drone1)" in document["flown"]
     [row] = csv.DictReader((tmp_path / "network.csv").read_text().splitlines())
     assert row == {

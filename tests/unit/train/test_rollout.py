@@ -15,9 +15,9 @@ from edge.core import F32, F64
 from edge.core.coverage import coverage_cost, voronoi_cells
 from edge.core.world import random_features, rasterize
 from edge.policy.bundle import Bundle
-from lpac.evaluate.worlds import FIELD, draw_world
 from lpac.sim.batch import BatchedFlights, fly_batch
 from lpac.sim.description import FIELD_SCALE
+from lpac.study.worlds import FIELD, draw_world
 from lpac.train.config import DaggerConfig, DataConfig, Disturbances, ExpertName, WorldRanges
 from lpac.train.data import Dataset, Shards
 from lpac.train.expert import Expert, assignment, make_expert
@@ -48,17 +48,21 @@ def states(shard: PlannedShard, shipped_bundle: Bundle) -> States:
 
 def test_flights_are_over_training_worlds_of_their_own() -> None:
     plans = [
-        [flight for shard in plan_round(DATA, DAGGER, seed, round_) for flight in shard.flights]
+        [
+            planned
+            for shard in plan_round(DATA, DAGGER, seed, round_)
+            for planned in zip(shard.scenarios, shard.by_expert, strict=True)
+        ]
         for seed in (0, 1)
         for round_ in (0, 1)
     ]
     assert [len(plan) for plan in plans] == [2, 4, 2, 4]
-    assert [flight.by_expert for flight in plans[1]] == [True, True, False, False]
-    assert all(flight.by_expert for flight in plans[0])
-    features = [flight.scenario.features for plan in plans for flight in plan]
+    assert [by_expert for _, by_expert in plans[1]] == [True, True, False, False]
+    assert all(by_expert for _, by_expert in plans[0])
+    features = [scenario.features for plan in plans for scenario, _ in plan]
     assert len(set(features)) == len(features)
-    assert plans[0][1].scenario.features == draw_world("training", 1, FIELD).features
-    assert plans[2][1].scenario.features == draw_world("training", 1_000_001, FIELD).features
+    assert plans[0][1][0].features == draw_world("training", 1, FIELD).features
+    assert plans[2][1][0].features == draw_world("training", 1_000_001, FIELD).features
 
 
 @given(seed=st.integers(0, 20), robots=st.integers(1, 60))
@@ -74,10 +78,10 @@ def test_draws_are_within_the_ranges(seed: int, robots: int) -> None:
     shards = plan_round(data, DAGGER, seed, 0)
     assert shards == plan_round(data, DAGGER, seed, 0)
     for shard in shards:
-        assert len(shard.flights) == 1 or sum(f.scenario.robots for f in shard.flights) <= 40
+        assert len(shard.scenarios) == 1 or sum(s.robots for s in shard.scenarios) <= 40
         times_s = np.array(shard.times_s)
         assert (np.diff(times_s) > 0.0).all() and times_s[0] >= 0.5 and times_s[-1] <= 20.0
-    flights = [flight.scenario for shard in shards for flight in shard.flights]
+    flights = [scenario for shard in shards for scenario in shard.scenarios]
     assert len(flights) == 9
     for flight in flights:
         assert 1 <= flight.robots <= robots and 0.1 <= flight.loss <= 0.3
@@ -89,12 +93,9 @@ def test_states_are_what_robots_perceive_and_the_expert_says(
     states: States, shard: PlannedShard, shipped_bundle: Bundle
 ) -> None:
     """As the policy flies: what it perceives, and what the expert would do instead."""
-    by_policy = replace(
-        shard, flights=tuple(flight._replace(by_expert=False) for flight in shard.flights)
-    )
+    by_policy = replace(shard, by_expert=(False,) * len(shard.scenarios))
     kept = fly_shard(ShardTask(by_policy, shipped_bundle)).states
-    scenarios = [flight.scenario for flight in shard.flights]
-    flights = BatchedFlights(scenarios, shipped_bundle)
+    flights = BatchedFlights(shard.scenarios, shipped_bundle)
     row = 0
     for moments in flights.moments(shard.times_s):
         for moment in moments:
@@ -118,10 +119,8 @@ def test_states_are_what_robots_perceive_and_the_expert_says(
 def test_the_expert_covers_better_than_it_began(
     shard: PlannedShard, shipped_bundle: Bundle
 ) -> None:
-    longer = replace(shard.flights[0].scenario, duration_s=30.0)
-    task = replace(
-        shard, flights=(shard.flights[0]._replace(scenario=longer),), times_s=(1.0, 25.0)
-    )
+    longer = replace(shard.scenarios[0], duration_s=30.0)
+    task = replace(shard, scenarios=(longer,), by_expert=(True,), times_s=(1.0, 25.0))
     first, last = fly_shard(ShardTask(task, shipped_bundle)).states.velocities.reshape(2, 10, 2)
     # It is nearly where it wants to be.
     assert np.linalg.norm(last, axis=1).mean() < 0.2 * np.linalg.norm(first, axis=1).mean()
@@ -129,13 +128,11 @@ def test_the_expert_covers_better_than_it_began(
 
 def test_who_decides_changes_nothing_else(shard: PlannedShard, shipped_bundle: Bundle) -> None:
     """The policy's flights come out as the simulator has them without us, payloads too."""
-    scenarios = [flight.scenario for flight in shard.flights]
     by_policy = replace(
-        shard, flights=tuple(flight._replace(by_expert=False) for flight in shard.flights),
-        times_s=(DATA.duration_s,),
-    )  # fmt: skip
+        shard, by_expert=(False,) * len(shard.scenarios), times_s=(DATA.duration_s,)
+    )
     kept = fly_shard(ShardTask(by_policy, shipped_bundle)).states
-    flown = fly_batch(scenarios, shipped_bundle)
+    flown = fly_batch(shard.scenarios, shipped_bundle)
     assert kept.largest_payload == max(each.largest_payload for each in flown)
 
 
@@ -143,7 +140,7 @@ def test_who_decides_changes_nothing_else(shard: PlannedShard, shipped_bundle: B
 def test_experts_leave_out_who_is_lost(
     expert: str, shard: PlannedShard, shipped_bundle: Bundle
 ) -> None:
-    prepared = BatchedFlights([shard.flights[0].scenario], shipped_bundle).prepared[0]
+    prepared = BatchedFlights([shard.scenarios[0]], shipped_bundle).prepared[0]
     told = make_expert(replace(DATA, expert=expert, lloyd_runs=2), prepared)  # type: ignore[arg-type]
     positions = FIELD_SCALE.position_to_model(prepared.starts_m)
     alive = np.arange(10) != 4
@@ -160,7 +157,7 @@ def test_what_overshoots_is_flown_no_faster(shard: PlannedShard, shipped_bundle:
     ends = {}
     for overshoot in (1.0, 3.0):
         task = replace(
-            shard, flights=shard.flights[:1], times_s=(2.0,),
+            shard, scenarios=shard.scenarios[:1], by_expert=shard.by_expert[:1], times_s=(2.0,),
             data=replace(DATA, overshoot=overshoot),
         )  # fmt: skip
         told = fly_shard(ShardTask(task, shipped_bundle)).states.velocities
@@ -176,9 +173,7 @@ def test_the_best_of_lloyd_ends_below_the_clairvoyant(shipped_bundle: Bundle) ->
     for expert in ("clairvoyant-cvt", "best-of-lloyd"):
         costs = []
         for shard in plan_round(DATA, DAGGER, 1, 0):
-            for world in BatchedFlights(
-                [f.scenario for f in shard.flights], shipped_bundle
-            ).prepared:
+            for world in BatchedFlights(shard.scenarios, shipped_bundle).prepared:
                 told = make_expert(replace(DATA, expert=expert), world)
                 positions = FIELD_SCALE.position_to_model(world.starts_m)
                 for _ in range(30):
@@ -208,7 +203,7 @@ def test_who_explores_ends_about_as_well_as_who_knows(shipped_bundle: Bundle) ->
     for expert in ("clairvoyant-cvt", "exploring-cvt"):
         costs = []
         [shard] = plan_round(DATA, DAGGER, 0, 0)
-        for world in BatchedFlights([f.scenario for f in shard.flights], shipped_bundle).prepared:
+        for world in BatchedFlights(shard.scenarios, shipped_bundle).prepared:
             told = make_expert(replace(DATA, expert=expert), world)
             positions = FIELD_SCALE.position_to_model(world.starts_m)
             for _ in range(100):
@@ -230,7 +225,7 @@ def test_the_coarse_raster_is_good_enough(shipped_bundle: Bundle) -> None:
         rng = np.random.default_rng(seed)
         importance = rasterize(random_features(rng, 10, 512), 512)
         scenario = replace(
-            plan_round(DATA, DAGGER, 0, 0)[0].flights[0].scenario,
+            plan_round(DATA, DAGGER, 0, 0)[0].scenarios[0],
             features=random_features(np.random.default_rng(seed), 10, 512),
         )
         [world] = BatchedFlights([scenario], shipped_bundle).prepared

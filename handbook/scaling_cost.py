@@ -1,4 +1,4 @@
-"""`python -m lpac.evaluate.scaling FOLDER...`: coverage cost over team size, by transport.
+"""`python -m handbook.scaling_cost FOLDER...`: coverage cost over team size, by transport.
 
 Of evaluations with `--transport`: docs/scaling-cost.png, and the table of docs/scaling.md to print.
 """
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from lpac.analysis import style
-from lpac.evaluate.worlds import SET_UPS
 
 IDEAL = "nothing lost or late"
 
@@ -39,18 +38,19 @@ def teams_of(told: Mapping[str, Any]) -> list[FlownTeam]:
     """Of an evaluation.json: one of each condition that is no other than by its radio."""
     teams = []
     for condition in told["conditions"]:
-        radio, [result, *_] = condition["radio_model"], condition["results"]
+        scenario, [result, *_] = condition["scenario"], condition["results"]
+        radio, link = scenario["radio"], scenario["link"]
         cost, low, high = result["over_clairvoyant"]["ratio_of_means"]
         teams.append(
             FlownTeam(
-                robots=SET_UPS[condition["set_up"]].robots,
+                robots=scenario["robots"],
                 radio=radio["transport"] if radio else IDEAL,
                 worlds=told["worlds"],
                 cost=cost,
                 low=low,
                 high=high,
-                loss=radio["loss"] if radio else 0.0,
-                delay_s=radio["delay_s"] if radio else 0.0,
+                loss=link["loss"],
+                delay_s=link["delay_s"],
             )
         )
     return teams
@@ -114,7 +114,7 @@ def _cell(team: FlownTeam) -> str:
 def main(folders: Sequence[str]) -> None:
     """Draw, and print the table, of the evaluations in these folders."""
     if not folders:
-        sys.exit("which folders? python -m lpac.evaluate.scaling FOLDER...")
+        sys.exit("which folders? python -m handbook.scaling_cost FOLDER...")
     try:
         told = [json.loads((Path(f) / "evaluation.json").read_text()) for f in folders]
     except FileNotFoundError as error:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lpac.evaluate.worlds import FIELD, SET_UPS, WORLD_SETS, WorldSet, at_equal_density, draw_world
+from lpac.study.worlds import FIELD, SET_UPS, WORLD_SETS, WorldSet, at_equal_density, draw_world
 
 
 @given(st.sampled_from(WORLD_SETS), st.integers(0, 2**31), st.sampled_from(sorted(SET_UPS)))

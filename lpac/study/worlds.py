@@ -10,11 +10,12 @@ at it, and then chooses, has no test set any more.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from edge.core.world import GaussianFeature, random_features
+from lpac.sim.scenario import Scenario
 
 WorldSet = Literal["training", "validation", "test"]
 WORLD_SETS: tuple[WorldSet, ...] = get_args(WorldSet)
@@ -49,6 +50,31 @@ class SetUp:
             raise ValueError(
                 f"communication_range = {self.communication_range}: must be positive and finite"
             )
+
+    def scenario(self, **changes: Any) -> Scenario:
+        """A flight in this set-up, which is otherwise than usual in what `changes` say."""
+        return Scenario(
+            **{
+                "robots": self.robots,
+                "world_size": self.world_size,
+                "communication_range": self.communication_range,
+                "random_feature_count": self.features,
+                "random_feature_sigma": self.sigma,
+                **changes,
+            }
+        )
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> "SetUp":
+        """That of a scenario whose sizes are known. Raises ValueError that names what is not."""
+        assert scenario.world_size is not None and scenario.communication_range is not None
+        return cls(
+            robots=scenario.robots,
+            world_size=scenario.world_size,
+            communication_range=scenario.communication_range,
+            features=scenario.random_feature_count,
+            sigma=scenario.random_feature_sigma,
+        )
 
 
 FIELD = SetUp(robots=10, world_size=512, communication_range=256.0, features=10)

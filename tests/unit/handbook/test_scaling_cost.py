@@ -3,18 +3,20 @@
 from pathlib import Path
 from typing import Any
 
-from lpac.evaluate.scaling import IDEAL, draw, table, teams_of
+from handbook.scaling_cost import IDEAL, draw, table, teams_of
 
 
-def told(set_up: str, worlds: int, costs: dict[str | None, float]) -> dict[str, Any]:
+def told(robots: int, worlds: int, costs: dict[str | None, float]) -> dict[str, Any]:
     """What an evaluation.json has of it."""
     return {
         "worlds": worlds,
         "conditions": [
             {
-                "set_up": set_up,
-                "radio_model": transport
-                and {"transport": transport, "loss": 0.25, "delay_s": 0.3031},
+                "scenario": {
+                    "robots": robots,
+                    "radio": transport and {"transport": transport},
+                    "link": {"loss": 0.25, "delay_s": 0.3031},
+                },
                 "results": [{"over_clairvoyant": {"ratio_of_means": [cost, cost, cost + 0.1]}}],
             }
             for transport, cost in costs.items()
@@ -23,8 +25,8 @@ def told(set_up: str, worlds: int, costs: dict[str | None, float]) -> dict[str, 
 
 
 TEAMS = [
-    *teams_of(told("n100", 2, {None: 1.1, "mesh": 1.456})),
-    *teams_of(told("field", 10, {None: 1.05, "mesh": 1.06, "multicast": 1.07})),
+    *teams_of(told(100, 2, {None: 1.1, "mesh": 1.456})),
+    *teams_of(told(10, 10, {None: 1.05, "mesh": 1.06, "multicast": 1.07})),
 ]
 
 

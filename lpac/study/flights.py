@@ -1,0 +1,182 @@
+"""The flights of a study: planned, flown in groups, and what came of them kept on disk."""
+
+import hashlib
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import edge
+from edge.policy.bundle import Bundle, BundleError
+from lpac import analysis, radio, sim, study
+from lpac.analysis.flight import FlightRecord
+from lpac.sim.cores import Outcome, Pool, in_this_process
+from lpac.sim.engines import IN_REAL_TIME, EngineName, engine_of, loaded_bundle
+from lpac.sim.experiment import cost_times_s
+from lpac.sim.kept import KeptOutcomes, code_digest
+from lpac.sim.scenario import Scenario
+
+POLICY = "lpac"
+CLAIRVOYANT = "clairvoyant-cvt"
+# Larger batches of the simulator are no faster.
+_ROBOTS_TOGETHER = 80
+_FLIGHTS = "flights.jsonl"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedFlight:
+    """A scenario, the engine that flies it, and the bundle.
+
+    `bundle` is the path of the one that flies, or that gives a baseline the sizes of sensor and
+    local map; `flown_by` is its id, or says these sizes. PX4s are those of `px4_build`.
+    """
+
+    scenario: Scenario
+    bundle: str
+    flown_by: str
+    engine: EngineName = "point"
+    px4_build: str = ""
+
+    @property
+    def key(self) -> str:
+        """What tells it from all other flights, wherever the bundle and PX4 lie."""
+        told = repr((self.engine, self.flown_by, self.scenario))
+        return hashlib.sha256(told.encode()).hexdigest()
+
+
+class CostCurve(NamedTuple):
+    """A cost (C,) at times (C,), s.
+
+    That is J, the coverage cost in model units of the robots that are left, or another task's.
+    `lloyd` is what the best of ten runs of Lloyd's algorithm, which know the world, come to from
+    the same starts: None but for flights of the clairvoyant.
+    """
+
+    time_s: tuple[float, ...]
+    cost: tuple[float, ...]
+    lloyd: float | None = None
+
+
+# Flights that go together: those of one batch of the simulator, or one other.
+FlightGroup = tuple[PlannedFlight, ...]
+# Flies a group, in whatever process it is, and says what came of each flight.
+CurvesOf = Callable[[FlightGroup], list[tuple[PlannedFlight, CostCurve]]]
+
+
+def task_of(bundle: Bundle) -> str:
+    """What policies must have in common to be compared. Raises BundleError without perception."""
+    perception, training = bundle.manifest.perception, bundle.manifest.training
+    if perception is None:
+        raise BundleError(f"bundle {bundle.manifest.name!r} has no perception: it cannot fly")
+    return (
+        f"sensor {perception.sensor_size}, speed {training.max_speed:g}, "
+        f"features cut at {training.idf_truncation:g}, scaled to {training.idf_norm:g}"
+    )
+
+
+def sizes_of(bundle: Bundle) -> str:
+    """What baselines take from a bundle. Raises BundleError without perception."""
+    task, perception = task_of(bundle), bundle.manifest.perception
+    assert perception is not None
+    unseen = perception.unknown_importance
+    return f"local map {perception.local_map_size}, unseen {unseen:g}, {task}"
+
+
+def groups_of(flights: Iterable[PlannedFlight]) -> list[FlightGroup]:
+    """The flights in groups that go together, in about their order."""
+    alike: dict[tuple[str, int], list[PlannedFlight]] = {}
+    groups: list[FlightGroup] = []
+    for flight in flights:
+        robots = flight.scenario.robots
+        if flight.scenario.controller != POLICY or flight.engine != "point":
+            groups.append((flight,))
+            continue
+        waiting = alike.setdefault((flight.bundle, robots), [])
+        waiting.append(flight)
+        if len(waiting) * robots >= _ROBOTS_TOGETHER:
+            groups.append(tuple(waiting))
+            waiting.clear()
+    return [*groups, *(tuple(waiting) for waiting in alike.values() if waiting)]
+
+
+def records_of(
+    group: FlightGroup, logs: Path | None = None
+) -> list[tuple[PlannedFlight, FlightRecord]]:
+    """Fly them, in whatever process this is; what programs leave is kept in a folder in `logs`.
+
+    Raises BundleError, ValueError, OSError, and what `lpac sim` does of programs in real time.
+    """
+    first = group[0]
+    if first.scenario.controller == POLICY and loaded_bundle(first.bundle).id != first.flown_by:
+        raise ValueError(f"{first.bundle}: is another bundle by now, or on this machine")
+    engine = engine_of(first.engine, Path(first.px4_build) if first.px4_build else None)
+    kept = logs / f"flight-{first.key[:8]}" if logs and first.engine in IN_REAL_TIME else None
+    flown = engine.fly([flight.scenario for flight in group], Path(first.bundle), kept)
+    return list(zip(group, flown, strict=True))
+
+
+def curves_of(group: FlightGroup) -> list[tuple[PlannedFlight, CostCurve]]:
+    """Fly them as `records_of` does, and keep no more than the costs."""
+    return [(flight, curve_of(flight, record)) for flight, record in records_of(group)]
+
+
+def curve_of(flight: PlannedFlight, record: FlightRecord) -> CostCurve:
+    """The cost over a flight, of where robots and vehicles truly are."""
+    time_s = cost_times_s(flight.scenario.duration_s)
+    true_cost = record.true_cost if record.truth else record.cost
+    cost = np.interp(time_s, record.curve_time_s, true_cost)
+    lloyd = record.lloyd if flight.scenario.controller == CLAIRVOYANT else None
+    return CostCurve(tuple(time_s.tolist()), tuple(cost.tolist()), lloyd)
+
+
+def fly_all(
+    do: Callable[[FlightGroup], list[tuple[PlannedFlight, Outcome]]],
+    flights: Sequence[PlannedFlight],
+    pool: Pool,
+) -> Generator[tuple[PlannedFlight, Outcome], None, None]:
+    """Each flight as it is done, with what `do` makes of its group.
+
+    Flights in real time are in this process, one after another, with nothing beside them.
+    """
+    groups: dict[bool, list[FlightGroup]] = {False: [], True: []}
+    for group in groups_of(flights):
+        groups[group[0].engine in IN_REAL_TIME].append(group)
+    for in_real_time, its in groups.items():
+        if its:
+            with closing((in_this_process if in_real_time else pool)(do, its)) as flown:
+                yield from chain.from_iterable(flown)
+
+
+class KeptFlights:
+    """What came of flights, in a folder: who asks again for one that was flown there has it."""
+
+    def __init__(self, folder: Path, curves: CurvesOf = curves_of) -> None:
+        """`curves` flies them; a folder has those of one alone. Raises OSError."""
+        self._curves_of = curves
+        flown_by = {"code": code_digest(edge, analysis, radio, sim, study)}
+        self._kept = KeptOutcomes(folder / _FLIGHTS, flown_by)
+        self._curves = {
+            line["flight"]: CostCurve(tuple(line["time_s"]), tuple(line["cost"]), line["lloyd"])
+            for line in self._kept.lines
+        }
+
+    def fly(
+        self, flights: Sequence[PlannedFlight], pool: Pool
+    ) -> Generator[tuple[PlannedFlight, CostCurve], None, None]:
+        """All of them: first what was flown before, and then the others as they come."""
+        missing = []
+        for flight in flights:
+            if flight.key in self._curves:
+                yield flight, self._curves[flight.key]
+            else:
+                missing.append(flight)
+        with closing(fly_all(self._curves_of, missing, pool)) as flown:
+            for flight, curve in flown:
+                self._curves[flight.key] = curve
+                line = {"flight": flight.key, "seed": flight.scenario.seed, **curve._asdict()}
+                self._kept.add(line)
+                yield flight, curve

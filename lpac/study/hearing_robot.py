@@ -1,0 +1,48 @@
+"""One robot of a bundle's policy that hears others, without a flight."""
+
+import numpy as np
+
+from edge.core.wire import most_bytes
+from edge.drivers.registry import load_policy
+from edge.identity.envelope import OVERHEAD_BYTES
+from edge.messages.beacon import BEACON_BYTES
+from edge.policy.bundle import Bundle
+from edge.policy.family import Observation, PolicyStep
+
+
+class HearingRobot:
+    """A robot among so many others around it, all of which it hears.
+
+    Raises BundleError if no robot can fly the bundle.
+    """
+
+    def __init__(self, others: int, bundle: Bundle) -> None:
+        policy, perception = load_policy(bundle), bundle.manifest.perception
+        assert perception is not None
+        self._agent = policy.agent()
+        rng = np.random.default_rng(0)
+        middle = np.full(2, perception.world_size / 2.0)
+        reach = perception.communication_range / 2.0
+        self._observed = Observation(
+            middle,
+            rng.random((perception.local_map_size,) * 2, np.float32),
+            middle + rng.uniform(-reach, reach, (others, 2)),
+            np.zeros(2),
+        )
+        self._heard = list(rng.random((others, policy.message_size), np.float32))
+
+    def step(self) -> PolicyStep:
+        """Perceive and decide."""
+        features = self._agent.observe(self._observed).features
+        return self._agent.step(features, self._heard, len(self._heard))
+
+
+def message_bytes(bundle: Bundle, others: int) -> int:
+    """The most that a robot says at a time once it has heard so many others, in float16.
+
+    Raises BundleError if no robot can fly it.
+    """
+    assert bundle.manifest.perception is not None
+    said = HearingRobot(others, bundle).step().payload
+    of_policy = most_bytes(said.size, "float16", bundle.manifest.perception.shared_map_side)
+    return BEACON_BYTES + of_policy + OVERHEAD_BYTES

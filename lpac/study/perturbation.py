@@ -1,0 +1,135 @@
+"""Flights from which robots are taken, and to which they come back."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from edge.messages.mission import FlightState
+from lpac.analysis.flight import FlightRecord
+from lpac.sim.experiment import SAMPLE_S
+from lpac.sim.scenario import Scenario
+
+# Settled is what stays within so much of what it comes to in the end.
+_SETTLED = 0.05
+
+
+class Absence(NamedTuple):
+    """A robot was taken away, and brought back; s."""
+
+    robot: str
+    from_s: float
+    until_s: float
+
+
+def absences_of(record: FlightRecord) -> list[Absence]:
+    """When pilots had robots, in the mission."""
+    piloted = [
+        Absence(robot.name, interval.begin_s, min(interval.end_s, record.duration_s))
+        for robot in record.robots
+        for interval in robot.intervals(record.duration_s)
+        if interval.state is FlightState.PILOT and 0.0 <= interval.begin_s < record.duration_s
+    ]
+    return sorted(piloted, key=lambda absence: absence.from_s)
+
+
+class Phase(NamedTuple):
+    """A robot is away, or back; the costs are over that at the start.
+
+    `settled_s` is how long after the phase began the cost last was further than 5 % from what it
+    came to at its end.
+    """
+
+    robot: str
+    away: bool
+    from_s: float
+    until_s: float
+    cost_before: float
+    cost_worst: float
+    cost_end: float
+    settled_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PerturbedFlight:
+    """A flight from which robots were taken, at times (T,), s.
+
+    `speed_m_s` and `neighbours` are (T, N), NaN of robots that are away.
+    """
+
+    record: FlightRecord
+    absences: Sequence[Absence]
+    time_s: F64
+    speed_m_s: F64
+    neighbours: F64
+    phases: tuple[Phase, ...]
+
+
+def perturbed_by(
+    record: FlightRecord, absences: Sequence[Absence], range_m: float
+) -> PerturbedFlight:
+    """What a flight says in which robots were away, one after another.
+
+    Neighbours are those within `range_m`. Raises ValueError if nobody was.
+    """
+    if not absences:
+        raise ValueError(f"{record.name}: no pilot took a robot in the mission")
+    names = [robot.name for robot in record.robots]
+    time_s = np.append(np.arange(0.0, record.duration_s - 1e-9, SAMPLE_S), record.duration_s)
+    places_m = np.stack([robot.places_at(time_s)[:, :2] for robot in record.robots], axis=1)
+    present = np.isfinite(places_m[..., 0])
+    for name, from_s, until_s in absences:
+        present[(time_s >= from_s) & (time_s < until_s), names.index(name)] = False
+    speed_m_s = np.full(present.shape, np.nan)
+    for robot, here in enumerate(present.T):
+        if here.sum() > 1:
+            # Across a gap it is on the straight way.
+            path_m = np.stack(
+                [np.interp(time_s, time_s[here], places_m[here, robot, k]) for k in (0, 1)], axis=1
+            )
+            speed_m_s[:, robot] = np.linalg.norm(np.gradient(path_m, time_s, axis=0), axis=1)
+    apart_m = np.linalg.norm(places_m[:, :, None] - places_m[:, None], axis=3)
+    heard = (apart_m < range_m) & present[:, :, None] & present[:, None, :]
+    neighbours = heard.sum(axis=2) - 1.0
+    for values in (speed_m_s, neighbours):
+        values[~present] = np.nan
+    ends_s = [absence.from_s for absence in absences[1:]] + [record.duration_s]
+    phases = tuple(
+        phase
+        for (robot, from_s, until_s), end_s in zip(absences, ends_s, strict=True)
+        for phase in (
+            _phase(record, robot, away=True, from_s=from_s, until_s=until_s),
+            _phase(record, robot, away=False, from_s=until_s, until_s=end_s),
+        )
+        if phase is not None
+    )
+    return PerturbedFlight(record, absences, time_s, speed_m_s, neighbours, phases)
+
+
+def _phase(
+    record: FlightRecord, robot: str, *, away: bool, from_s: float, until_s: float
+) -> Phase | None:
+    """None if it was too short for a cost."""
+    times_s, cost = record.curve_time_s, record.normalized
+    before, inside = cost[times_s < from_s], (times_s >= from_s) & (times_s < until_s)
+    if not inside.any() or not len(before):
+        return None
+    its_s, its = times_s[inside], cost[inside]
+    off = np.flatnonzero(np.abs(its / its[-1] - 1.0) > _SETTLED)
+    return Phase(
+        robot=robot,
+        away=away,
+        from_s=from_s,
+        until_s=until_s,
+        cost_before=float(before[-1]),
+        cost_worst=float(its.max()),
+        cost_end=float(its[-1]),
+        settled_s=float(its_s[off[-1]] - from_s) if len(off) else 0.0,
+    )
+
+
+def absences_in(scenario: Scenario) -> list[Absence]:
+    """When points fail that come back; they are named by their numbers."""
+    return [Absence(str(f.robot), f.from_s, f.until_s) for f in scenario.failures]

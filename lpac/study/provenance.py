@@ -1,0 +1,31 @@
+"""What made an experiment: its command, its policies, what was drawn, and versions."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+
+import edge
+import lpac
+from lpac.sim.kept import code_digest
+from lpac.study.study import Study
+
+
+def made_by(
+    command: str, bundle_ids: Sequence[str], drawn: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """By what it is called; `drawn` says which worlds, or which seeds."""
+    told = {"command": f"lpac {command}", "bundle": ", ".join(bundle_ids), **(drawn or {})}
+    return {
+        **{what: value for what, value in told.items() if value},
+        "lpac-edge": f"{version('lpac-edge')}, code {code_digest(edge, lpac)[:12]}",
+        "python": platform.python_version(),
+        **{package: version(package) for package in ("numpy", "onnxruntime")},
+    }
+
+
+def made_by_study(command: str, study: Study) -> dict[str, str]:
+    """The same of a study's bundles and worlds."""
+    ids = [each.bundle_id for method in study.methods for each in method.trainings]
+    first, last = study.draws[0].world, study.draws[-1].world
+    worlds = f"{first} to {last} of the {study.world_set} set, and their seeds"
+    return made_by(command, ids, {"worlds": worlds})

@@ -1,0 +1,78 @@
+"""What a study leaves in its folder: figures, NAME.json, NAME.csv, and README.md."""
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+
+class Table(NamedTuple):
+    """A table with a row of headings; `title` stands above it, `note` below."""
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    title: str = ""
+    note: str = ""
+
+
+class Picture(NamedTuple):
+    """A figure in the report's folder, and what it shows."""
+
+    file: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """What is told of an experiment.
+
+    The `legend` explains all tables. `told` is for scripts, `rows` are the CSV's, its heading
+    first. `flown` says how it was flown, `made_by` what made it: command, policies, versions.
+    """
+
+    name: str
+    title: str
+    text: str
+    told: Mapping[str, Any]
+    rows: Sequence[Sequence[object]]
+    tables: Sequence[Table]
+    figures: Sequence[Picture]
+    flown: str
+    legend: str = ""
+    made_by: Mapping[str, str]
+
+    def write(self, folder: Path) -> dict[str, Any]:
+        """NAME.json, NAME.csv and README.md; gives the JSON. Raises OSError."""
+        document = {**self.told, "flown": self.flown, "made_by": dict(self.made_by)}
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{self.name}.json").write_text(json.dumps(document, indent=2) + "\n")
+        write_csv(self.rows, folder / f"{self.name}.csv")
+        told = {name: getattr(self, name) for name in self.__slots__}
+        (folder / "README.md").write_text(_environment().get_template("report.md").render(told))
+        return document
+
+
+def write_csv(rows: Sequence[Sequence[object]], path: Path) -> None:
+    """Raises OSError."""
+    with path.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+@cache
+def _environment() -> Environment:
+    made = Environment(
+        loader=PackageLoader("lpac.study"), undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
+    made.filters["cell"] = _cell
+    return made
+
+
+def _cell(text: str) -> str:
+    """On one line; a vertical line would begin another cell."""
+    return text.replace("-\n", "").replace("\n", " ").replace("|", "&#124;")

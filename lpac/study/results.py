@@ -1,0 +1,254 @@
+"""Results of a study: what methods came to over its worlds, and how surely they differ.
+
+Costs are normalised by a world's at the start, with all robots. What the numbers mean:
+
+- **final** is the cost at the end, **area** the mean over the flight: the area under the curve over
+  its duration.
+- **x clairvoyant** and **x best of ten** are over what ClairvoyantCVT comes to in the same world in
+  the same time, and over the best of ten runs of Lloyd's algorithm on the true density. Neither is
+  a bound. Of values over all worlds it is the ratio of the means; else world by world.
+- A world **fails** if it ends above `FAILS_ABOVE` x clairvoyant. Costs **rise again** if they end
+  more than 5 % above their own least.
+- Where robots are lost in flight, baselines and Lloyd's algorithm never had them.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from edge.core import F64, Bools
+from lpac.analysis.statistics import (
+    Verdict,
+    at_most_share,
+    bootstrap,
+    compare,
+    interquartile_mean,
+    mean_over_time,
+    paired_bootstrap,
+    ratio_of_means,
+)
+from lpac.sim.scenario import Scenario
+from lpac.study.flights import CLAIRVOYANT, CostCurve, PlannedFlight
+from lpac.study.study import Condition, Method, Study
+
+FAILS_ABOVE = 1.5
+_RISEN = 1.05
+_QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MethodResult:
+    """Costs of a method under one condition, in S trainings over K worlds.
+
+    `time_s` (C,), and `curves` (S, K, C): the normalised cost then. `clairvoyant` and `best_of_ten`
+    (1, K) are the normalised costs that it is held against. `lost_at_s` is when robots were lost.
+    """
+
+    method: Method
+    time_s: F64
+    curves: F64
+    clairvoyant: F64
+    best_of_ten: F64
+    lost_at_s: float
+
+    @property
+    def final(self) -> F64:
+        """(S, K)."""
+        return self.curves[..., -1]
+
+    @property
+    def area(self) -> F64:
+        """(S, K)."""
+        return mean_over_time(self.time_s, self.curves)
+
+    @property
+    def over_clairvoyant(self) -> F64:
+        """(S, K)."""
+        return self.final / self.clairvoyant
+
+    @property
+    def over_best_of_ten(self) -> F64:
+        """(S, K)."""
+        return self.final / self.best_of_ten
+
+    @property
+    def rises_again(self) -> Bools:
+        """(S, K); since robots were lost, if any were."""
+        since = self.curves[..., self.time_s >= self.lost_at_s]
+        risen: Bools = self.final > _RISEN * since.min(axis=-1)
+        return risen
+
+
+def results_of(
+    study: Study, curves: Mapping[PlannedFlight, CostCurve]
+) -> dict[Condition, list[MethodResult]]:
+    """Of all its flights: under each condition each method's result, in the study's order."""
+    return {condition: _of_condition(study, condition, curves) for condition in study.conditions}
+
+
+def _of_condition(
+    study: Study, condition: Condition, curves: Mapping[PlannedFlight, CostCurve]
+) -> list[MethodResult]:
+    methods = study.methods_of(condition)
+    flown = {
+        method.name: [
+            [curves[flight] for flight in study.flights_of(method, condition, draw)]
+            for draw in study.draws
+        ]
+        for method in methods
+    }
+    costs = {
+        name: np.array([[flight.cost for flight in of_world] for of_world in its]).swapaxes(0, 1)
+        for name, its in flown.items()
+    }
+    best_of_ten = np.array([[flight.lloyd for flight in its] for its in flown[CLAIRVOYANT]]).T
+    # Baselines begin without those who are lost later, and so with more cost.
+    initial = np.min([its[:, :, 0].min(axis=0) for its in costs.values()], axis=0)
+    return [
+        MethodResult(
+            method=method,
+            time_s=np.array(flown[method.name][0][0].time_s),
+            curves=costs[method.name] / initial[:, None],
+            clairvoyant=costs[CLAIRVOYANT][:, :, -1] / initial,
+            best_of_ten=best_of_ten / initial,
+            lost_at_s=condition.lost.at_s if method.trained else 0.0,
+        )
+        for method in methods
+    ]
+
+
+def as_json(
+    study: Study, results: Mapping[Condition, Sequence[MethodResult]], *, compared: bool = False
+) -> dict[str, Any]:
+    """All numbers, for scripts; `compared` sets the first method against the second."""
+    return {
+        "world_set": study.world_set,
+        "first_world": study.first_world,
+        "worlds": study.worlds,
+        "trials_per_world": study.trials,
+        "methods": [
+            {"name": method.name, "bundles": [each._asdict() for each in method.trainings]}
+            for method in study.all_methods
+        ],
+        "baselines_with": study.sizes,
+        "fails_above": FAILS_ABOVE,
+        "conditions": conditions_json(results, compared=compared),
+    }
+
+
+def conditions_json(
+    results: Mapping[Condition, Sequence[MethodResult]], *, compared: bool = False
+) -> list[dict[str, Any]]:
+    """What each method came to under each condition; see `as_json`."""
+    return [
+        {
+            "name": condition.name,
+            "set_up": condition.set_up,
+            "engine": condition.engine,
+            "from_pads": condition.from_pads,
+            "lost_robots": condition.lost.robots,
+            "lost_at_s": condition.lost.at_s,
+            "scenario": scenario_json(condition.scenario),
+            "results": [_result_json(result, of_all) for result in of_all],
+            "compared": _verdict_json(verdict_of(of_all[0], of_all[1])) if compared else None,
+        }
+        for condition, of_all in results.items()
+    ]
+
+
+def scenario_json(scenario: Scenario) -> dict[str, Any]:
+    """All but what is drawn for each world; and what messages suffer."""
+    told = asdict(replace(scenario, features=None))
+    drawn = ("features", "seed", "controller")
+    return {
+        **{name: value for name, value in told.items() if name not in drawn},
+        "link": scenario.link._asdict(),
+    }
+
+
+def verdict_of(a: MethodResult, b: MethodResult) -> Verdict:
+    """By the cost at the end."""
+    return compare(a.final, b.final, trained_a=a.method.trained, trained_b=b.method.trained)
+
+
+def _verdict_json(verdict: Verdict) -> dict[str, Any]:
+    """Intervals as [value, low, high]."""
+    return {**verdict._asdict(), **{name: list(getattr(verdict, name)) for name in _INTERVALS}}
+
+
+_INTERVALS = ("difference", "ratio", "a_below_b")
+
+
+def _result_json(result: MethodResult, of_all: Iterable[MethodResult]) -> dict[str, Any]:
+    final = result.final
+    return {
+        "name": result.method.name,
+        "trainings": len(final),
+        "final": _distribution(final),
+        "area": _distribution(result.area),
+        "over_clairvoyant": {
+            **_distribution(result.over_clairvoyant),
+            "ratio_of_means": list(paired_bootstrap(final, result.clairvoyant, ratio_of_means)),
+        },
+        "over_best_of_ten": {
+            **_distribution(result.over_best_of_ten),
+            "ratio_of_means": list(paired_bootstrap(final, result.best_of_ten, ratio_of_means)),
+        },
+        "fails": _share_json(result.over_clairvoyant > FAILS_ABOVE),
+        "rises_again": _share_json(result.rises_again),
+        "above": {
+            other.method.name: _share_json(final > other.final.mean(axis=0))
+            for other in of_all
+            if other is not result
+        },
+        "against": {
+            other.method.name: _verdict_json(verdict_of(result, other))
+            for other in of_all
+            if other is not result and not other.method.trained
+        },
+        "by_world": {
+            "final": final.tolist(),
+            "over_clairvoyant": result.over_clairvoyant.tolist(),
+            "over_best_of_ten": result.over_best_of_ten.tolist(),
+        },
+        "median_curve": {
+            "time_s": result.time_s.tolist(),
+            "normalized_cost": np.median(result.curves, axis=(0, 1)).tolist(),
+        },
+    }
+
+
+def _distribution(values: F64) -> dict[str, Any]:
+    """Of (S, K); intervals as [value, low, high]."""
+    worst = np.unravel_index(values.argmax(), values.shape)
+    return {
+        "mean": list(bootstrap(values)),
+        "interquartile_mean": list(bootstrap(values, interquartile_mean)),
+        "deviation": float(values.std(ddof=1)) if values.size > 1 else None,
+        "quantiles": {f"{share:g}": float(np.quantile(values, share)) for share in _QUANTILES},
+        "worst": float(values[worst]),
+        "worst_world": int(worst[1]),
+    }
+
+
+def _share_json(failed: Bools) -> dict[str, Any]:
+    """How many of (S, K) bools, and how many in truth at most, at 95 % confidence.
+
+    Flights of several trainings over one world are not independent: so the bound counts worlds,
+    each with the share of its trainings.
+    """
+    of, share = failed.shape[1], float(failed.mean())
+    return {
+        "share": share,
+        "worlds": of,
+        "at_most_share": at_most_share(of, math.ceil(share * of - 1e-9)),
+    }
+
+
+def worst_worlds(result: MethodResult, count: int) -> list[int]:
+    """Positions among the study's worlds where it ends highest over clairvoyant, on average."""
+    ascending = np.argsort(result.over_clairvoyant.mean(axis=0), kind="stable")
+    return [int(world) for world in ascending[::-1][:count]]

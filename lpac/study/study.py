@@ -1,0 +1,397 @@
+"""A study: policies and baselines over the worlds of a set, under conditions.
+
+It is a TOML file (docs/research.md has one), or made in Python. Its flights follow from it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple, get_args
+
+import numpy as np
+from msgspec import Meta
+
+from edge.core import F64
+from edge.core.counted import counted
+from edge.core.schema import AtLeastOne, Bounded, NonNegative
+from edge.policy.bundle import load_bundle
+from lpac.shipped import SHIPPED_BUNDLE
+from lpac.sim.baselines import BaselineName
+from lpac.sim.description import FIELD_SCALE
+from lpac.sim.engines import Engine, EngineName, engine_of
+from lpac.sim.failure import NONE_LOST, Failure, LostRobots
+from lpac.sim.fleet.layout import Layout, pads_for_all
+from lpac.sim.scenario import Scenario
+from lpac.study.flights import CLAIRVOYANT, PlannedFlight, sizes_of, task_of
+from lpac.study.worlds import FIELD, SET_UPS, SetUp, WorldSet, draw_world
+
+BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
+Figure = Literal[
+    "curves", "distributions", "pairs", "conditions", "worst", "snapshots", "repeatability",
+    "perturbation", "rates",
+]  # fmt: skip
+# Those of a study that does not say.
+USUAL_FIGURES: tuple[Figure, ...] = ("curves", "distributions", "pairs", "conditions", "worst")
+# Those of whole flights, and not of their costs alone.
+_OF_RECORDS = ("snapshots", "repeatability", "perturbation")
+
+
+class Draw(NamedTuple):
+    """A world of the set, by its number, and which of the trials in it."""
+
+    world: int
+    trial: int = 0
+
+
+class TrainedBundle(NamedTuple):
+    """A bundle: its path, and its id."""
+
+    path: str
+    bundle_id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Method:
+    """A baseline, or a policy by the bundles of its trainings, which differ in their seed alone."""
+
+    name: str
+    trainings: tuple[TrainedBundle, ...] = ()
+
+    @property
+    def trained(self) -> bool:
+        """Whether it is no baseline."""
+        return bool(self.trainings)
+
+    @classmethod
+    def of(cls, name: str, *bundles: Path | str) -> "Method":
+        """A policy by the paths of its bundles, or the baseline of that name if there are none.
+
+        Raises BundleError; ValueError for a name that is no baseline's.
+        """
+        if not bundles and name not in BASELINES:
+            raise ValueError(f"baseline {name!r}: must be one of {', '.join(BASELINES)}")
+        trainings = (TrainedBundle(str(Path(p).resolve()), load_bundle(p).id) for p in bundles)
+        return cls(name=name, trainings=tuple(trainings))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Condition:
+    """What flights have alike under which all methods fly.
+
+    `scenario` has their sizes; its world, starts and seed are drawn for each world of the set,
+    unless it has features of its own. `engine` flies the policies; baselines are points. Points
+    begin `from_pads`, on which whole robots would stand, and are as wrong about their places as
+    these. The last robots are `lost` in flight; baselines never had them. With `methods` it is
+    flown by those of these names alone.
+
+    Raises ValueError that names what is impossible.
+    """
+
+    scenario: Scenario = field(default_factory=FIELD.scenario)
+    engine: EngineName = "point"
+    from_pads: bool = False
+    lost: LostRobots = NONE_LOST
+    methods: tuple[str, ...] = ()
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        SetUp.of(self.scenario)
+        duration_s, robots = self.scenario.duration_s, self.scenario.robots
+        if self.lost.robots and not 0.0 < self.lost.at_s < duration_s:
+            raise ValueError(f"robots lost at {self.lost.at_s:g} s: must be in flight")
+        if self.lost.robots >= robots:
+            raise ValueError(f"{self.lost.robots} robots lost: must be fewer than {robots}")
+
+    @property
+    def name(self) -> str:
+        """For people: its title, or else its set-up and what is otherwise than usual."""
+        return self.title or ", ".join([self.set_up, *self._differences()])
+
+    @property
+    def set_up(self) -> str:
+        """By its name; or its sizes, if it has none."""
+        own = SetUp.of(self.scenario)
+        for name, known in SET_UPS.items():
+            if known == own:
+                return name
+        return (
+            f"{own.robots} robots in {own.world_size} x {own.world_size} units, {own.features} "
+            f"features, range {own.communication_range:g}"
+        )
+
+    def _differences(self) -> Iterator[str]:
+        scenario = self.scenario
+        if scenario.loss:
+            yield f"{100.0 * scenario.loss:g} % of messages lost"
+        if scenario.radio:
+            yield f"{scenario.radio.transport} by the model"
+        if self.lost.robots:
+            yield f"{self.lost.robots} of {scenario.robots} robots lost at {self.lost.at_s:g} s"
+        if scenario.lag_s:
+            yield f"lag {scenario.lag_s:g} s"
+        if scenario.position_error_m:
+            yield f"positions off by {scenario.position_error_m:g} m"
+        if scenario.payload != "float16":
+            yield f"payloads in {scenario.payload}"
+        if scenario.failures:
+            yield f"{counted(len(scenario.failures), 'robot')} away for a while"
+        if self.from_pads:
+            yield "points from pads, GPS off"
+        usual = FIELD.scenario()
+        for each in fields(Scenario):
+            value = getattr(scenario, each.name)
+            if each.name not in _SAID and value != getattr(usual, each.name):
+                yield f"{each.name} = {_short(value)}"
+        if self.engine != "point":
+            yield _ENGINES[self.engine]
+
+
+_ENGINES: dict[EngineName, str] = {
+    "simulated": "whole robots",
+    "mavlink": "whole robots, as programs",
+    "px4": "whole robots, on PX4",
+}
+# Of a scenario, what `Condition.name` says in words, or what is drawn.
+_SAID = {
+    "controller", "robots", "seed", "duration_s", "world_size", "communication_range",
+    "random_feature_count", "random_feature_sigma", "loss", "radio", "lag_s", "position_error_m",
+    "payload", "scale", "failures",
+}  # fmt: skip
+
+
+def _short(value: object) -> str:
+    """A value; of a dataclass what is otherwise than by default."""
+    if not hasattr(value, "__dataclass_fields__"):
+        return f"{value:g}" if isinstance(value, float) else f"{value}"
+    usual = type(value)()
+    changed = (f.name for f in fields(value) if getattr(value, f.name) != getattr(usual, f.name))  # type: ignore[arg-type]
+    return ", ".join(f"{name} {_short(getattr(value, name))}" for name in changed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Study(Bounded):
+    """Policies over `worlds` worlds of a set from `first_world` on, under each condition.
+
+    In each world robots start where its number says, or in all where the `first` one's robots do,
+    with the same receivers and the same wind if they are whole. Each world is flown in so many
+    `trials`, which differ in all that is drawn but the world: starts are within `placed_within_m`
+    of the same places, and the positions of points are wrong by `receiver_error_m` (least,
+    greatest) throughout.
+
+    The clairvoyant baseline is always among them, since all are held against it. Baselines take
+    their sizes from the first bundle, or from that at `sizes_from` if no policy flies. The
+    `figures` are drawn of the results. `px4_build` is where real PX4s are taken from.
+
+    Raises BundleError; ValueError that names what is impossible, also what an engine cannot do.
+    """
+
+    methods: tuple[Method, ...]
+    conditions: Annotated[tuple[Condition, ...], Meta(min_length=1)] = (Condition(),)
+    world_set: WorldSet = "validation"
+    first_world: Annotated[int, Meta(ge=0)] = 0
+    worlds: AtLeastOne = 20
+    starts: Literal["own", "first"] = "own"
+    trials: AtLeastOne = 1
+    placed_within_m: NonNegative = 0.0
+    receiver_error_m: tuple[NonNegative, NonNegative] | None = None
+    title: str = ""
+    text: str = ""
+    figures: tuple[Figure, ...] = USUAL_FIGURES
+    sizes_from: str = str(SHIPPED_BUNDLE)
+    px4_build: str = ""
+
+    def check_rules(self) -> None:
+        """See `Bounded`."""
+        least_m, greatest_m = self.receiver_error_m or (0.0, 0.0)
+        if least_m > greatest_m:
+            raise ValueError(
+                f"receiver_error_m = {self.receiver_error_m}: must be [least, greatest]"
+            )
+        names = [method.name for method in self.all_methods]
+        if len(set(names)) < len(names):
+            raise ValueError(f"methods {', '.join(names)}: each once")
+        for condition in self.conditions:
+            engine = self.engine_of(condition)
+            engine.require_able(condition.scenario)
+            if engine.whole_robots and (condition.lost.robots or condition.from_pads):
+                raise ValueError("lost, from_pads: are of points alone")
+            for name in condition.methods:
+                if name not in names:
+                    raise ValueError(f"methods = {name!r}: must be one of {', '.join(names)}")
+        tasks = {task_of(load_bundle(path)): path for path in self._bundles}
+        if len(tasks) > 1:
+            different = "; ".join(f"{path}: {task}" for task, path in tasks.items())
+            raise ValueError(f"bundles of different tasks: {different}")
+
+    @property
+    def all_methods(self) -> tuple[Method, ...]:
+        """With the clairvoyant baseline."""
+        if CLAIRVOYANT in [method.name for method in self.methods]:
+            return self.methods
+        return (*self.methods, Method(name=CLAIRVOYANT))
+
+    @property
+    def _bundles(self) -> list[str]:
+        """The paths of all."""
+        return list(dict.fromkeys(each.path for p in self.methods for each in p.trainings))
+
+    @property
+    def sized_by(self) -> str:
+        """The path of the bundle from which baselines take their sizes."""
+        return next(iter(self._bundles), self.sizes_from)
+
+    @property
+    def sizes(self) -> str:
+        """What baselines take from a bundle, in words."""
+        return sizes_of(load_bundle(self.sized_by))
+
+    @property
+    def draws(self) -> list[Draw]:
+        """All trials in all worlds."""
+        numbers = range(self.first_world, self.first_world + self.worlds)
+        return [Draw(world, trial) for world in numbers for trial in range(self.trials)]
+
+    @property
+    def needs_records(self) -> bool:
+        """Whether its figures are of whole flights; these are not kept, but flown again."""
+        return any(figure in _OF_RECORDS for figure in self.figures)
+
+    def engine_of(self, condition: Condition) -> Engine:
+        """What flies the policies. Raises ValueError without PX4's build where that is needed."""
+        is_px4 = condition.engine == "px4"
+        if is_px4 and not self.px4_build:
+            raise ValueError("engine = 'px4': needs PX4's build folder")
+        return engine_of(condition.engine, Path(self.px4_build) if is_px4 else None)
+
+    def methods_of(self, condition: Condition) -> tuple[Method, ...]:
+        """Those that fly under a condition."""
+        return tuple(
+            method
+            for method in self.all_methods
+            if not condition.methods or method.name in (*condition.methods, CLAIRVOYANT)
+        )
+
+    def flights(self) -> list[PlannedFlight]:
+        """All of them, each once; those over one world beside each other."""
+        wanted = (
+            flight
+            for condition in self.conditions
+            for draw in self.draws
+            for method in self.methods_of(condition)
+            for flight in self.flights_of(method, condition, draw)
+        )
+        return list(dict.fromkeys(wanted))
+
+    def flights_of(
+        self, method: Method, condition: Condition, draw: Draw
+    ) -> Iterator[PlannedFlight]:
+        """One of each training; of a baseline one."""
+        scenario = self._scenario(method, condition, draw)
+        trainings = method.trainings or (TrainedBundle(self.sized_by, self.sizes),)
+        for path, bundle_id in trainings:
+            yield PlannedFlight(
+                scenario=scenario,
+                bundle=path,
+                flown_by=bundle_id,
+                engine=condition.engine if method.trained else "point",
+                px4_build=self.px4_build if method.trained and condition.engine == "px4" else "",
+            )
+
+    def _scenario(self, method: Method, condition: Condition, draw: Draw) -> Scenario:
+        template, set_up = condition.scenario, SetUp.of(condition.scenario)
+        drawn = draw_world(self.world_set, draw.world, set_up)
+        first = drawn
+        if self.starts == "first":
+            first = draw_world(self.world_set, self.first_world, set_up)
+        on_pads = condition.from_pads or condition.engine != "point"
+        scenario = replace(
+            template,
+            # Where whole robots stand, their receivers and the wind follow from it.
+            seed=(first if on_pads else drawn).seed + draw.trial,
+            features=template.features or drawn.features,
+        )
+        rng = np.random.default_rng(np.random.SeedSequence([first.seed, draw.trial]))
+        starts_m: F64 | None = None
+        if template.starts_m is not None:
+            starts_m = np.array(template.starts_m)
+        elif not on_pads:
+            starts_m = FIELD_SCALE.position_to_mission_m(np.array(first.starts, np.float64))
+        elif self.trials > 1:
+            seeds = range(first.seed, first.seed + self.trials)
+            each = [replace(_on_pads(scenario), seed=seed) for seed in seeds]
+            starts_m = pads_for_all(each, Path(self.sized_by), self.placed_within_m)
+        if starts_m is not None and self.placed_within_m:
+            radii_m = self.placed_within_m * rng.uniform(0.0, 1.0, len(starts_m)) ** 0.5
+            starts_m = starts_m + _around(radii_m, rng)
+        if starts_m is not None:
+            scenario = replace(scenario, starts_m=_pairs(starts_m))
+        if method.trained and condition.engine != "point":
+            return scenario
+        if on_pads:
+            pads_m, bias_m = _pads(_on_pads(scenario), self.sized_by)
+            scenario = replace(scenario, starts_m=_pairs(pads_m))
+        elif self.receiver_error_m is not None:
+            bias_m = _around(rng.uniform(*self.receiver_error_m, scenario.robots), rng)
+        else:
+            bias_m = None
+        if bias_m is not None:
+            scenario = replace(scenario, position_bias=_pairs(bias_m * FIELD_SCALE.env_scale))
+        if method.trained:
+            return replace(scenario, failures=self._failures(condition))
+        return _of_baseline(scenario, method.name, condition.lost.robots)
+
+    def _failures(self, condition: Condition) -> tuple[Failure, ...]:
+        scenario = condition.scenario
+        return (*scenario.failures, *condition.lost.failures(scenario.robots))
+
+
+_USUAL = Scenario()
+# What a baseline has no use for: it senses and decides at once, and nothing is sent.
+_OF_POLICIES = (
+    "loss", "delay_s", "radio", "max_message_age_s", "max_input_age_s", "payload", "clocks",
+    "errors", "wind_m_s", "budget", "sensor", "secure", "transport", "failures",
+)  # fmt: skip
+# What points alone have, or has nothing to do with where whole robots would stand.
+_OF_POINTS = (
+    "radio", "payload", "lag_s", "position_error_m", "max_speed_m_s", "clocks", "failures",
+)  # fmt: skip
+
+
+def _of_baseline(scenario: Scenario, name: str, lost: int) -> Scenario:
+    """The same flown by a baseline, which never had those that are lost."""
+    # Starts are drawn alike for all: whoever is lost might be anybody.
+    robots, starts_m, bias = scenario.robots - lost, scenario.starts_m, scenario.position_bias
+    [controller] = [baseline for baseline in BASELINES if baseline == name]
+    return replace(
+        scenario,
+        controller=controller,
+        robots=robots,
+        starts_m=starts_m and starts_m[:robots],
+        position_bias=bias and bias[:robots],
+        **{each: getattr(_USUAL, each) for each in _OF_POLICIES},
+    )
+
+
+def _on_pads(scenario: Scenario) -> Scenario:
+    """Whole robots in the world of points, for where these would stand."""
+    return replace(scenario, **{name: getattr(_USUAL, name) for name in _OF_POINTS})
+
+
+def _around(radii_m: F64, rng: np.random.Generator) -> F64:
+    """(N, 2): so far from the origin, each in a direction of its own."""
+    angles_rad = rng.uniform(0.0, 2.0 * np.pi, len(radii_m))
+    directions = np.column_stack([np.cos(angles_rad), np.sin(angles_rad)])
+    offsets_m: F64 = radii_m[:, None] * directions
+    return offsets_m
+
+
+@cache
+def _pads(scenario: Scenario, bundle: str) -> tuple[F64, F64]:
+    """(N, 2) each: where whole robots stand, and what their receivers are off by there, m."""
+    layout = Layout(scenario, Path(bundle))
+    return layout.pads_m, layout.landing_points_m - layout.pads_m
+
+
+def _pairs(rows: F64) -> tuple[tuple[float, float], ...]:
+    return tuple((x, y) for x, y in rows.tolist())
