@@ -121,7 +121,8 @@ class Mailbox:
     def neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
         """Who is near and where, by robot id; takes nothing away."""
         with self._lock:
-            received = sorted((self._handed_out | self._received).items())
+            newest = self._handed_out | self._received if self._handed_out else self._received
+            received = sorted(newest.items())
         kept_s = self._kept_s
         return tuple(
             Neighbour(

@@ -85,7 +85,7 @@ def overlap(start: int, size: int, world_size: int) -> tuple[slice, slice]:
 
     Empty, at the border, if they share nothing.
     """
-    low, high = (min(max(cell, 0), world_size) for cell in (start, start + size))
+    low, high = min(max(start, 0), world_size), min(max(start + size, 0), world_size)
     return slice(low, high), slice(low - start, high - start)
 
 

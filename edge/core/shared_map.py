@@ -39,8 +39,10 @@ class SharedMap(NamedTuple):
 
 def codes_of(importance: F32) -> Codes:
     """The bytes for importance of any shape, which is finite: to the nearest, from 0 to 61440."""
-    bits = np.clip(importance, 0.0, _LARGEST).astype(np.float16).view(np.uint16)
-    return (((bits + (1 << (_SHIFT - 1))) >> _SHIFT) + 1).astype(np.uint8)
+    bounded: F32 = np.minimum(np.maximum(importance, 0.0), _LARGEST)
+    bits = bounded.astype(np.float16).view(np.uint16)
+    codes: Codes = (((bits + (1 << (_SHIFT - 1))) >> _SHIFT) + 1).astype(np.uint8)
+    return codes
 
 
 def importance_of(codes: Codes) -> F32:
@@ -114,7 +116,8 @@ class SharedCells:
         codes = np.zeros((-(-size // self._cell) + 1,) * 2, np.uint8)
         here, there = self._overlap(first, codes.shape)
         codes[there] = self._codes[here]
-        fine = importance_of(codes).repeat(self._cell, axis=0).repeat(self._cell, axis=1)
+        # In this order whole rows are copied last, which takes half as long.
+        fine = importance_of(codes).repeat(self._cell, axis=1).repeat(self._cell, axis=0)
         x, y = corner[0] % self._cell, corner[1] % self._cell
         return fine[x : x + size, y : y + size]
 

@@ -127,14 +127,16 @@ class Consumption:
         )
 
     def _median(self, field: int) -> float | None:
-        values = [entry[field] for entry in self._recent]
-        known = [value for value in values if value is not None and math.isfinite(value)]
         # A battery that is silent now is not known, whatever it said before.
-        if not known or values[-1] is None:
+        if not self._recent or self._recent[-1][field] is None:
             return None
+        values = [value for entry in self._recent if (value := entry[field]) is not None]
         # numpy's takes twenty times as long for so few.
-        ordered, middle = sorted(known), len(known) // 2
-        return ordered[middle] if len(known) % 2 else (ordered[middle - 1] + ordered[middle]) / 2.0
+        ordered = sorted(filter(math.isfinite, values))
+        if not ordered:
+            return None
+        middle, is_odd = divmod(len(ordered), 2)
+        return ordered[middle] if is_odd else (ordered[middle - 1] + ordered[middle]) / 2.0
 
 
 def _drain(samples: deque[tuple[float, float]]) -> float:

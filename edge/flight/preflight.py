@@ -347,6 +347,8 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
             f"the ground hears robot {robot_id}, and this robot does not: they would not keep "
             "apart; `lpac fleet radio` tells who hears whom",
         )
+    bundle_tag, world_tag = tag(inputs.bundle_id), tag(inputs.world_id)
+    frame_id = None if inputs.origin is None else inputs.origin.frame().frame_id
     for beacon, _ in others:
         other = f"robot {beacon.robot_id}"
         if beacon.system_id is not None and beacon.system_id == inputs.system_id:
@@ -354,16 +356,16 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
                 CheckCode.SAME_SYSTEM_ID,
                 f"{other}'s vehicle has the same system id {beacon.system_id}: set MAV_SYS_ID",
             )
-        if beacon.bundle_tag != tag(inputs.bundle_id):
+        if beacon.bundle_tag != bundle_tag:
             yield FailedCheck(
                 CheckCode.OTHER_BUNDLE, f"{other} has another bundle: deploy one to all"
             )
-        if beacon.world_tag != tag(inputs.world_id):
+        if beacon.world_tag != world_tag:
             yield FailedCheck(
                 CheckCode.OTHER_WORLD,
                 f"{other} has another world: set one on the ground, or deploy it to all",
             )
-        if inputs.origin is not None and beacon.frame_id != inputs.origin.frame().frame_id:
+        if frame_id is not None and beacon.frame_id != frame_id:
             yield FailedCheck(
                 CheckCode.OTHER_ORIGIN,
                 f"{other} has another mission origin: set it again on the ground",

@@ -302,15 +302,18 @@ def _who_is_near(
 ) -> list[_Near]:
     rest_m = position_m[:2] + velocity_m_s[:2] * limits.lag_s
     near: list[_Near] = []
+    own_height_m = float(position_m[2])
     for neighbour in neighbours:
-        place_m = np.array(_extrapolated(neighbour))
-        here_m, up_m = place_m[:2] - position_m[:2], float(place_m[2] - position_m[2])
+        *place_m, height_m = _extrapolated(neighbour)
+        up_m = height_m - own_height_m
         least_m = separation.piloted_m if neighbour.is_piloted else separation.passing_m
         if _passes(up_m, neighbour.velocity_m_s[2], separation, limits):
-            near.append(_to_leave(place_m[:2] - rest_m, least_m, separation, from_rest=True))
+            near.append(_to_leave(place_m - rest_m, least_m, separation, from_rest=True))
         elif neighbour.is_piloted and abs(up_m) < separation.passing_height_m:
+            here_m = place_m - position_m[:2]
             near.append(_to_leave(here_m, least_m, separation, from_rest=False))
         elif abs(up_m) < separation.level_m:
+            here_m = place_m - position_m[:2]
             # Squares of far smaller numbers than a separation may vanish: never below 0.
             needed_m = math.sqrt(max(separation.level_m**2 - up_m * up_m, 0.0))
             slack_m = (math.hypot(*here_m) - needed_m) / 2.0

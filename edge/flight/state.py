@@ -246,11 +246,8 @@ class Robot:
     @property
     def separation(self) -> SeparationLimits:
         """How far it stays from the others, who err as it does and fly by the same parameters."""
-        p, errors, limits = self.parameters, self.errors, self.limits
+        p, errors = self.parameters, self.errors
         passing_m = max(errors.passing_m, p.min_separation_m)
-        # By where it flies after that, at its greatest speed, when it is to hold.
-        stops_s = stopping_m(limits.max_speed_m_s, limits) / limits.max_speed_m_s
-        lands_after_s = max(p.hover_land_s, p.ground_timeout_s + p.ground_lost_land_s)
         return SeparationLimits(
             level_m=p.min_separation_m,
             passing_m=passing_m,
@@ -261,12 +258,21 @@ class Robot:
             landed_m=max(
                 places_apart(errors.position_m, errors.position_m).least_m, p.min_separation_m
             ),
-            silence=SilenceLimits(
-                max_speed_m_s=limits.max_speed_m_s,
-                ceiling_m=self.fence.ceiling_m + errors.height_m,
-                flies_on_s=p.ground_timeout_s + stops_s,
-                hovers_s=lands_after_s + _LANDS_WITHIN_S,
-            ),
+            silence=self.silence,
+        )
+
+    @property
+    def silence(self) -> SilenceLimits:
+        """What one of the others may do that fell silent."""
+        p, limits = self.parameters, self.limits
+        # By where it flies after that, at its greatest speed, when it is to hold.
+        stops_s = stopping_m(limits.max_speed_m_s, limits) / limits.max_speed_m_s
+        lands_after_s = max(p.hover_land_s, p.ground_timeout_s + p.ground_lost_land_s)
+        return SilenceLimits(
+            max_speed_m_s=limits.max_speed_m_s,
+            ceiling_m=self.fence.ceiling_m + self.errors.height_m,
+            flies_on_s=p.ground_timeout_s + stops_s,
+            hovers_s=lands_after_s + _LANDS_WITHIN_S,
         )
 
     def told(self, ground: GroundState) -> tuple[Fence, Place]:

@@ -138,8 +138,10 @@ def _lift(t: Tick) -> Lift:
 
 def _with(flight: FlightMemory, **changes: Any) -> FlightMemory:
     """The memory with these fields; itself if they are so already, as they mostly are."""
-    same = all(getattr(flight, name) == value for name, value in changes.items())
-    return flight if same else replace(flight, **changes)
+    for name, value in changes.items():
+        if getattr(flight, name) != value:
+            return replace(flight, **changes)
+    return flight
 
 
 def _alone_since_s(t: Tick) -> float | None:

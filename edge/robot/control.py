@@ -143,7 +143,7 @@ class FlightControl:
         # Another thread replaces them meanwhile.
         peers = self.peers
         heard = self._neighbours(peers, now_s)
-        silence = self.assignment.robot.separation.silence
+        silence = self.assignment.robot.silence
         silent = self._silent(peers, heard, silence, now_s)
         self.fell_silent = tuple(each for each in silent if highest_still_m(each, silence) > 0.0)
         inputs = FlightInputs(
@@ -434,9 +434,7 @@ class FlightControl:
             standing
             for each in silent
             if each.age_s > _SILENT_FOR_GOOD_S
-            for standing in may_stand(
-                each, others[each.robot_id].landing_point_m, robot.separation.silence
-            )
+            for standing in may_stand(each, others[each.robot_id].landing_point_m, robot.silence)
         ]
         # Of two who look for a place, the lower one is first.
         return_first = [

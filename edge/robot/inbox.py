@@ -3,6 +3,7 @@
 The link's threads only put bytes in; whoever takes something out decodes it.
 """
 
+import functools
 import math
 from collections import deque
 from dataclasses import replace
@@ -126,7 +127,7 @@ class Inbox:
         while self._grounds:
             arrived = self._grounds.popleft()
             try:
-                state = decode(GroundState, arrived.data)
+                state = _ground_state(arrived.data)
             except MessageError as error:
                 self.not_understood_count += 1
                 self.ground_refusal = str(error)
@@ -273,6 +274,12 @@ class Inbox:
                 and at_s - max(since_s, self._beacon_at_s.get(robot_id, -math.inf))
                 >= _HEARD_WITHIN_S
             )
+
+
+@functools.lru_cache(maxsize=4)
+def _ground_state(data: bytes) -> GroundState:
+    """The robots of one process, as in a simulator, hear the same bytes. Raises MessageError."""
+    return decode(GroundState, data)
 
 
 def _is_own(operator: str, speaker: Speaker) -> bool:

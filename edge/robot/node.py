@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 from edge.core.logger import log
 from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
-from edge.core.vehicle import Action
+from edge.core.vehicle import Action, VehicleState
 from edge.flight.state import flown_s, in_air
 from edge.identity.guard import Guard, Speaker
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon, tag
@@ -44,7 +44,7 @@ from edge.robot.config import RobotConfig
 from edge.robot.control import FlightControl, GroundWorld
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation
-from edge.robot.pac import Pac
+from edge.robot.pac import Pac, PolicyTick
 from edge.robot.readiness import Readiness
 
 _EXPLORED_PERIOD_S = 1.0
@@ -59,6 +59,11 @@ _RADIO_COUNTS_PERIOD_S = 1.9
 _SILENT_TICKS, _SILENT_S = 1.5, 1.0
 # Where it commands the vehicle, and may set it back to what it was.
 _STEERS = (FlightState.ARMING, *AIRBORNE)
+# Of what is logged whole.
+_FIELDS: dict[type, tuple[str, ...]] = {
+    kind: tuple(field.name for field in dataclasses.fields(kind))
+    for kind in (RobotStatus, VehicleState, PolicyTick)
+}
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
 
 
@@ -243,7 +248,7 @@ class RobotNode:
         if tick is None:
             return
         self._publish_message(tick.message)
-        record = {field.name: getattr(tick, field.name) for field in dataclasses.fields(tick)}
+        record = {name: getattr(tick, name) for name in _FIELDS[PolicyTick]}
         self._ports.recorder.record("policy", self._ports.clock.unix_s(), record)
 
     def _tell_once(self, problem: str) -> None:
@@ -374,8 +379,12 @@ class RobotNode:
             # The policy is silent, or hangs: neighbours must not lose this robot's place.
             self._publish_message()
         vehicle = self._ports.vehicle.state()
-        for topic, value in (("status", status), ("vehicle", vehicle)):
-            fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        logged: tuple[tuple[str, type, object], ...] = (
+            ("status", RobotStatus, status),
+            ("vehicle", VehicleState, vehicle),
+        )
+        for topic, kind, value in logged:
+            fields = {name: getattr(value, name) for name in _FIELDS[kind]}
             self._ports.recorder.record(topic, unix_now_s, fields)
         if status.position_m is not None:
             yaw_rad = status.heading_rad

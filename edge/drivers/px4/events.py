@@ -13,6 +13,7 @@ import re
 import struct
 from collections import deque
 from collections.abc import Iterable, Mapping
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 from edge.core.vehicle import AutopilotReason, Mode
@@ -430,6 +431,8 @@ class Px4Events:
         self._report: list[_Check] | None = None
         self._can_arm = self._report_can_arm = 0
         self._checks: tuple[_Check, ...] = ()
+        # What `wrong` made of them, by the mode.
+        self._wrong: dict[Mode | None, tuple[AutopilotReason, ...]] = {}
         self._told: deque[_Told] = deque(maxlen=16)
 
     def hear(self, fields: Mapping[str, Any], now_s: float) -> None:
@@ -447,6 +450,7 @@ class Px4Events:
             if self._report is not None:
                 self._can_arm = self._report_can_arm
                 self._checks = tuple(sorted(self._report, key=lambda check: check.level))
+                self._wrong.clear()
             self._report = None
         elif self._report is not None and _NAMES.get(event, "check_").startswith("check_"):
             modes = struct.unpack_from(_MODES_AND_COMPONENT, arguments)[0]
@@ -483,12 +487,16 @@ class Px4Events:
 
     def told(self, since_s: float) -> tuple[AutopilotReason, ...]:
         """What PX4 warned of once since then, the newest first."""
-        return _reasons(told for told in reversed(self._told) if told.at_s >= since_s)
+        recent = takewhile(lambda told: told.at_s >= since_s, reversed(self._told))
+        return _reasons(recent)
 
     def wrong(self, mode: Mode | None) -> tuple[AutopilotReason, ...]:
         """What PX4 finds wrong now that concerns this mode, the gravest first."""
-        bits = _bits(mode)
-        return _reasons(c for c in self._checks if c.level <= _WARNING and c.modes & bits)
+        if mode not in self._wrong:
+            bits = _bits(mode)
+            grave = (c for c in self._checks if c.level <= _WARNING and c.modes & bits)
+            self._wrong[mode] = _reasons(grave)
+        return self._wrong[mode]
 
     def _is_next(self, sequence: int, now_s: float, *, arrived: bool = True) -> bool:
         """Whether the event with that number comes next; if not, what lies between is missing."""

@@ -92,6 +92,8 @@ class _Path:
 class _Second:
     """Frame counts of one second."""
 
+    __slots__ = ("again", "lost", "others", "second", "taken", "timed")
+
     def __init__(self, second: int) -> None:
         self.second = second
         self.taken = self.timed = self.lost = self.again = self.others = 0

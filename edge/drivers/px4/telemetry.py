@@ -175,7 +175,8 @@ class Px4Telemetry:
                 fields["thrust"] = None
             if heard.armed:
                 told = self._events.told(self._told_since_s(now_s))
-                fields["warnings"] = without_repetition((*told, *self._events.wrong(heard.mode)))
+                wrong = self._events.wrong(heard.mode)
+                fields["warnings"] = without_repetition((*told, *wrong)) if told else wrong
             elif not armable:
                 fields["problems"] = self._why_not_armed(now_s - _TOLD_FOR_S)
             if self._told is None or self._told[0] != fields:
@@ -439,17 +440,15 @@ class Px4Telemetry:
         last_origin = self._heard.origin
         if last_m is None or last_m_s is None:
             return 0.0, 0.0, 0.0
-        shift_m = (0.0, 0.0, 0.0)
+        shift = (0.0, 0.0, 0.0)
         if origin is not None and last_origin is not None:
-            shift_m = _shift_m(last_origin, origin)
-        north_m, east_m, down_m = (
-            position_m[i]
-            + shift_m[i]
-            - last_m[i]
-            - (last_m_s[i] + velocity_m_s[i]) / 2.0 * between_s
-            for i in range(3)
+            shift = _shift_m(last_origin, origin)
+        now, last, now_m_s = position_m, last_m, velocity_m_s
+        return (
+            now[0] + shift[0] - last[0] - (last_m_s[0] + now_m_s[0]) / 2.0 * between_s,
+            now[1] + shift[1] - last[1] - (last_m_s[1] + now_m_s[1]) / 2.0 * between_s,
+            now[2] + shift[2] - last[2] - (last_m_s[2] + now_m_s[2]) / 2.0 * between_s,
         )
-        return north_m, east_m, down_m
 
     def _on_statustext(self, fields: Fields, now_s: float) -> None:
         text = fields["text"].strip()
@@ -534,10 +533,9 @@ class _VehicleClock:
         return self.delay_s
 
 
-def _vector(fields: Fields, *names: str) -> Vector:
+def _vector(fields: Fields, x: str, y: str, z: str) -> Vector:
     """Raises TypeError if one is not finite: then it has no value in the message."""
-    x, y, z = (float(fields[name]) for name in names)
-    return x, y, z
+    return float(fields[x]), float(fields[y]), float(fields[z])
 
 
 def _is_jump(off_m: Vector, between_s: float) -> bool:

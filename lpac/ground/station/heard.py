@@ -36,6 +36,8 @@ class _ProgramStart:
 
     first_s: float
     heard: deque[_HeardStatus] = field(default_factory=deque)
+    # What came of the other robots' messages meanwhile.
+    arrivals: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
     def newest(self) -> _HeardStatus:
@@ -46,13 +48,18 @@ class _ProgramStart:
         if self.heard and heard.status.sequence <= self.newest.status.sequence:
             return False
         self.heard.append(heard)
+        changed = [heard]
         while heard.at_s - self.heard[0].at_s > _ARRIVALS_WINDOW_S:
-            self.heard.popleft()
+            changed.append(self.heard.popleft())
+        if any(h.status.radio_counts is not None for h in changed):
+            counts = [h.status.radio_counts for h in self.heard]
+            self.arrivals = _arrivals([each for each in counts if each is not None])
         return True
 
     def recent(self) -> list[_HeardStatus]:
         """What it said in the last few seconds, the newest last."""
-        return [h for h in self.heard if self.newest.at_s - h.at_s <= _RATE_WINDOW_S]
+        newest_at_s = self.newest.at_s
+        return [h for h in self.heard if newest_at_s - h.at_s <= _RATE_WINDOW_S]
 
 
 class _Robot:
@@ -114,9 +121,7 @@ class _Robot:
             # Delay only makes a clock look late.
             clock_offset_s=max(heard.clock_ahead_s for heard in recent),
             rates_hz=_rates_hz(recent[0].status, newest),
-            arrivals=_arrivals(
-                [h.status.radio_counts for h in program.heard if h.status.radio_counts is not None]
-            ),
+            arrivals=program.arrivals,
             duplicate=self.duplicate,
         )
 

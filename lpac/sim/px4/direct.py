@@ -153,7 +153,7 @@ def _rounded(message: Any) -> Any:
     names, bits = _real_fields(message.__class__)
     if names:
         fields = vars(message)
-        values = bits.unpack(bits.pack(*(fields[name] for name in names)))
+        values = bits.unpack(bits.pack(*map(fields.__getitem__, names)))
         fields.update(zip(names, values, strict=True))
     return message
 

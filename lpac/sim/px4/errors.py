@@ -145,17 +145,15 @@ class Errors:
 
         It is noise of a few decimetres, and an echo of up to 3.5 m for some seconds.
         """
-        noise_m = [math.fsum([wave.about(time_s) for wave in waves]) for waves in self._fix]
+        noise_m = [_sum_about(waves, time_s) for waves in self._fix]
         since_s = time_s % self._echo_every_s - (self._echo_every_s - self._echo_for_s)
         echo = math.sin(math.pi * since_s / self._echo_for_s) if since_s > 0.0 else 0.0
         return plus(noise_m, times(self._echo_m, echo))
 
     def velocity_m_s(self, time_s: float) -> Vector:
         """North, east, down: what the estimate of the velocity errs by; 0 down."""
-        north, east = (
-            math.fsum([wave.about(time_s) for wave in waves]) for waves in self._velocity
-        )
-        return north, east, 0.0
+        north, east = self._velocity
+        return _sum_about(north, time_s), _sum_about(east, time_s), 0.0
 
     def gps_accuracy_m(self, time_s: float) -> tuple[float, float]:
         """What the receiver says of its fix, horizontally and vertically."""
@@ -190,6 +188,11 @@ class Errors:
     def is_remote_control_stale(self, time_s: float) -> bool:
         """Whether the remote control's receiver hears nothing just now."""
         return time_s % self._stale_every_s > self._stale_every_s - self._stale_for_s
+
+
+def _sum_about(waves: list[Wave], time_s: float) -> float:
+    """How far the sum of the waves is from its middle."""
+    return math.fsum([a * math.sin(rate * time_s + phase) for a, rate, phase in waves])
 
 
 def _draw_wave(rng: np.random.Generator, amplitude: float, periods_s: tuple[float, float]) -> Wave:

@@ -12,7 +12,7 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -116,7 +116,7 @@ class Px4Setpoint:
     yaw_rad: float = math.nan
 
 
-class SimulatedSensor(Enum):
+class SimulatedSensor(StrEnum):
     """What a driver may die of."""
 
     GPS = "gps"
@@ -556,7 +556,8 @@ class Px4Vehicle:
         self.time_s += dt_s
         self._watch_sensors()
         self._estimate(dt_s)
-        self.gps_offset_m = self.gps_offset_m + self.gps_drift_m_s * dt_s
+        if any(self.gps_drift_m_s.tolist()):
+            self.gps_offset_m = self.gps_offset_m + self.gps_drift_m_s * dt_s
         self._air_m_s = plus(self.wind_m_s.tolist(), self._gust_m_s)
         self._velocity_error_m_s = self.estimator.velocity_error_m_s
         if self._errors is not None:
@@ -815,10 +816,10 @@ class Px4Vehicle:
             if 0.0 < radius_m < math.hypot(north_m, east_m) or 0.0 < height_m < -down_m:
                 return True
         north_m, east_m, _ = estimate_m
-        return any(
-            polygon.contains(self._world, north_m, east_m) != polygon.inclusion
-            for polygon in self.fence
-        )
+        for polygon in self.fence:
+            if polygon.contains(self._world, north_m, east_m) != polygon.inclusion:
+                return True
+        return False
 
     def _on_position_loss(self) -> FailsafeAction:
         lost = self.intended_mode in NEED_POSITION and not self.position_valid
