@@ -1,4 +1,4 @@
-"""What a set of results says, and how surely. Pure numpy; less is better throughout.
+"""Statistics of results over worlds and trainings; less is better throughout.
 
 Values of a method are (S, K): of S trainings, which differ in their seed alone, over the same K
 worlds. A method of one training, such as a baseline, is (1, K). Worlds are drawn, and so are
@@ -10,11 +10,12 @@ share: Clopper and Pearson, Biometrika 26 (1934).
 """
 
 import math
+import warnings
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+import scipy  # its parts are loaded on first use: scipy.stats takes a second
 
 from edge.core import F64
 
@@ -83,10 +84,7 @@ def share_below(a: F64, b: F64) -> F64:
 
 def bootstrap(values: F64, statistic: Callable[[F64], F64] = mean) -> Interval95:
     """A statistic of (S, K), with the interval over other worlds and other trainings."""
-    rng = np.random.default_rng(_SEED)
-    worlds = _drawn(rng, values.shape[1])
-    drawn = values[_drawn(rng, len(values))[:, :, None], worlds[:, None]]
-    return _interval(statistic(values), statistic(drawn))
+    return _interval(lambda *drawn: statistic(_taken(values, *drawn)), *values.shape)
 
 
 def paired_bootstrap(
@@ -102,11 +100,12 @@ def paired_bootstrap(
         raise ValueError(f"{a.shape[1]} worlds of one and {b.shape[1]} of the other: no pairs")
     if same_trainings and len(a) != len(b):
         raise ValueError(f"{len(a)} trainings of one and {len(b)} of the other: not the same")
-    rng = np.random.default_rng(_SEED)
-    worlds = _drawn(rng, a.shape[1])[:, None]
-    of_a = _drawn(rng, len(a))[:, :, None]
-    of_b = of_a if same_trainings else _drawn(rng, len(b))[:, :, None]
-    return _interval(statistic(a, b), statistic(a[of_a, worlds], b[of_b, worlds]))
+    if same_trainings:
+        return _interval(lambda *drawn: statistic(_taken(a, *drawn), _taken(b, *drawn)), *a.shape)
+    return _interval(
+        lambda of_a, of_b, worlds: statistic(_taken(a, of_a, worlds), _taken(b, of_b, worlds)),
+        len(a), *b.shape,
+    )  # fmt: skip
 
 
 class Verdict(NamedTuple):
@@ -180,8 +179,7 @@ def performance_profile(values: F64, thresholds: F64) -> F64:
 
 def mean_over_time(time_s: F64, curves: F64) -> F64:
     """(...,): the area under curves (..., T) at times (T,), ascending, over their duration."""
-    area = ((curves[..., 1:] + curves[..., :-1]) * np.diff(time_s)).sum(axis=-1) / 2.0
-    means: F64 = area / (time_s[-1] - time_s[0])
+    means: F64 = np.trapezoid(curves, time_s) / (time_s[-1] - time_s[0])
     return means
 
 
@@ -190,35 +188,42 @@ def at_most_share(of: int, failed: int) -> float:
 
     Clopper and Pearson's bound; of n without any it is 1 - 0.05^(1/n), about 3 / n.
     """
-    if failed >= of:
+    if of == 0:
         return 1.0
-    low, high = failed / of, 1.0
-    while high - low > 1e-6:
-        share = (low + high) / 2.0
-        if _at_most(failed, of, share) > 1.0 - CONFIDENCE:
-            low = share
-        else:
-            high = share
-    return high
+    test = scipy.stats.binomtest(failed, of, alternative="less")
+    return float(test.proportion_ci(CONFIDENCE, method="exact").high)
 
 
-def _at_most(failed: int, of: int, share: float) -> float:
-    """How likely it is that no more than so many fail."""
-    return math.fsum(
-        math.comb(of, k) * share**k * (1.0 - share) ** (of - k) for k in range(failed + 1)
-    )
+def _taken(values: F64, trainings: Any, worlds: Any) -> F64:
+    """(..., S, K): of (S', K') values those of trainings (..., S) and worlds (..., K)."""
+    taken: F64 = values[trainings[..., :, None], worlds[..., None, :]]
+    return taken
 
 
-def _drawn(rng: np.random.Generator, count: int) -> npt.NDArray[np.intp]:
-    """(_RESAMPLES, count): so many of so many, with replacement."""
-    return rng.integers(count, size=(_RESAMPLES, count))
+def _interval(statistic: Callable[..., F64], *counts: int) -> Interval95:
+    """Bootstrap a statistic of indices: (..., n) for each of the `counts`, drawn independently.
 
+    Draws whose statistic is NaN do not count; the interval is NaN if no other is left.
+    """
+    whole = dict(enumerate(map(np.arange, counts)))
+    # scipy draws from no sample of one.
+    several = [place for place, count in enumerate(counts) if count > 1]
 
-def _interval(value: F64, drawn: F64) -> Interval95:
-    """The percentiles of what was drawn and is a number; NaN if nothing is."""
-    beyond = (1.0 - CONFIDENCE) / 2.0
-    known = drawn[~np.isnan(drawn)]
+    def of_drawn(*drawn: Any, axis: int) -> F64:
+        return statistic(*(whole | dict(zip(several, drawn, strict=True))).values())
+
+    value = float(statistic(*whole.values()))
+    if not several:
+        return Interval95(value, value, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)  # of NaN
+        found = scipy.stats.bootstrap(
+            [whole[place] for place in several], of_drawn, n_resamples=_RESAMPLES,
+            vectorized=True, method="percentile", rng=_SEED,
+        )  # fmt: skip
+    known = found.bootstrap_distribution[~np.isnan(found.bootstrap_distribution)]
     if not len(known):
         return Interval95(math.nan, math.nan, math.nan)
+    beyond = (1.0 - CONFIDENCE) / 2.0
     low, high = np.quantile(known, (beyond, 1.0 - beyond)).tolist()
-    return Interval95(float(value), low, high)
+    return Interval95(value, low, high)

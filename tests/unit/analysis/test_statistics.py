@@ -164,6 +164,17 @@ def test_ratio_and_share() -> None:
     a, b = np.array([[1.0, 2.0, 3.0]]), np.array([[2.0, 2.0, 2.0]])
     assert ratio_of_means(a, b) == 1.0 and share_below(a, b) == 0.5
     assert math.isnan(ratio_of_means(a, 0.0 * b))
+    assert all(map(math.isnan, compare(a, 0.0 * b).ratio))
+    # In some draws all of the other is 0: they tell nothing of the ratio.
+    seldom = compare(a, np.array([[0.0, 0.0, 2.0]])).ratio
+    assert 0.0 < seldom.low < seldom.value < seldom.high < math.inf
+
+
+def test_one_flight_has_no_spread() -> None:
+    assert bootstrap(np.array([[0.3]])) == (0.3, 0.3, 0.3)
+    one = compare(np.array([[0.3], [0.5]]), np.array([[0.4]]))
+    assert one.better is None
+    assert (one.difference.low, one.difference.high) == pytest.approx((-0.1, 0.1))
 
 
 @given(methods(), st.lists(COSTS, min_size=1, max_size=10))
