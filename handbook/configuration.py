@@ -9,6 +9,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from msgspec import Meta
+
 from edge.core.schema import in_words
 from edge.policy.bundle import Manifest
 from edge.policy.lpac.manifest import LpacManifest
@@ -172,7 +174,8 @@ def _tables(
             its = f"{path}.{field.name}" if path else field.name
             several = "list of tables" in _kind(hint)
             below.append((within, its, f"[[{its}]]" if several else f"[{its}]"))
-        rows.append((f"`{field.name}`", cell(_kind(hint)), _default(field)))
+        about = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, str)]
+        rows.append((f"`{field.name}`", cell("; ".join([_kind(hint), *about])), _default(field)))
     if rows:
         yield table(("key", "value", "if it is left out"), rows)
     for within, its, heading in below:
@@ -203,8 +206,11 @@ def _within(hint: Any) -> type[Any] | None:
 def _kind(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        bounds = " and ".join(map(in_words, hint.__metadata__))
-        return f"{_kind(hint.__origin__)} ({bounds})"
+        bounds = " and ".join(
+            in_words(each) for each in hint.__metadata__ if isinstance(each, Meta)
+        )
+        kind = _kind(hint.__origin__)
+        return f"{kind} ({bounds})" if bounds else kind
     if dataclasses.is_dataclass(hint):
         return "table"
     if origin is Literal:

@@ -1,13 +1,15 @@
 """`lpac evaluate`: policies and baselines over many worlds, and how surely one is better."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from msgspec import Meta
 
 from lpac.cli.apps import new_app
+from lpac.cli.fields import options_of
 from lpac.cli.options import (
     DEFAULT_BUNDLE,
     AsJson,
@@ -30,9 +32,10 @@ app = new_app()
 _OUT = Path("out/evaluate")
 
 
-@app.command()
-def evaluate(
-    *,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateOptions:
+    """Options of the study that is flown."""
+
     methods: Annotated[
         list[str] | None,
         typer.Argument(
@@ -40,187 +43,191 @@ def evaluate(
             help="Policy bundles, the shipped one if none is given; several trainings of one "
             "method joined by commas; or names of baselines.",
         ),
-    ] = None,
+    ] = None
     world_set: Annotated[
-        str, typer.Option("--set", help="training, validation, or test; look at test only once.")
-    ] = "validation",
+        str,
+        typer.Option("--set", help="training, validation, or test; look at test only once."),
+    ] = "validation"
     worlds: Annotated[
-        int, typer.Option("--worlds", "-k", help="How many worlds of it, from the first on.")
-    ] = 20,
-    duration: Annotated[float, typer.Option(help="Flight time, s.")] = 60.0,
+        int,
+        Meta(ge=1),
+        typer.Option("--worlds", "-k", help="How many worlds of it, from the first on."),
+    ] = 20
     set_ups: Annotated[
         list[str] | None,
         typer.Option(
-            "--set-up",
-            metavar="NAME",
+            "--set-up", metavar="NAME",
             help="Team and world: field (the default), n1 to n1000, paper, features-3, range-64, "
             "and more (docs/research.md); may be repeated.",
         ),
-    ] = None,
+    ] = None  # fmt: skip
     transfer: Annotated[
-        bool,
+        bool, "All set-ups: other numbers of robots at equal density, features and ranges."
+    ] = False
+    baselines: Annotated[
+        list[str] | None,
         typer.Option(
-            help="All set-ups: other numbers of robots at equal density, features and ranges."
+            "--baseline", metavar="NAME", help="Only these, and clairvoyant-cvt; else all."
         ),
-    ] = False,
+    ] = None
+    compare: Annotated[bool, "Say whether the first of two methods is better."] = False
+    px4: Px4 = None
+    ray: Ray = None
+    as_json: AsJson = False
+    out: Annotated[
+        Path, "Folder for README.md, evaluation.json, figures, pictures, and what was flown."
+    ] = _OUT
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConditionOptions:
+    """Options of further conditions, each flown beside the usual one."""
+
+    duration: Annotated[float, "Flight time, s."] = 60.0
     losses: Annotated[
         list[float] | None,
         typer.Option("--loss", help="Also with messages lost with this probability."),
-    ] = None,
+    ] = None
     transports: Annotated[
         list[str] | None,
         typer.Option(
-            "--transport",
-            metavar="NAME",
+            "--transport", metavar="NAME",
             help="Also with the radio that such a team would have, by a model of one Wi-Fi "
             "channel: mesh, router or multicast.",
         ),
-    ] = None,
-    wifi: WifiFile = None,
+    ] = None  # fmt: skip
+    wifi: WifiFile = None
     lost: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ROBOTS@S", help="Also with robots lost in flight, such as 2@20: two at 20 s."
         ),
-    ] = None,
+    ] = None
     lags: Annotated[
         list[float] | None,
         typer.Option(
             "--lag", help="Also with robots that respond with this time constant, s; baselines too."
         ),
-    ] = None,
+    ] = None
     position_errors: Annotated[
         list[float] | None,
         typer.Option(
             "--position-error",
             help="Also with robots that are wrong about where they are: standard deviation, m.",
         ),
-    ] = None,
+    ] = None
     payloads: Annotated[
         list[str] | None,
         typer.Option(
-            "--payload",
-            metavar="TYPE",
+            "--payload", metavar="TYPE",
             help="Also with messages that carry float32 or int8 instead of float16; each --loss "
             "and --transport is then flown with them, too.",
         ),
-    ] = None,
+    ] = None  # fmt: skip
     vehicle: Annotated[
         VehicleKind,
-        typer.Option(
-            help="Also as the field is flown: whole robots, at most 30, as `lpac sim` has them, "
-            "and points from the same pads."
-        ),
-    ] = VehicleKind.POINT,
-    px4: Px4 = None,
-    baselines: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--baseline", metavar="NAME", help="Only these, and clairvoyant-cvt; else all."
-        ),
-    ] = None,
-    compare: Annotated[
-        bool, typer.Option("--compare", help="Say whether the first of two methods is better.")
-    ] = False,
-    ray: Ray = None,
-    as_json: AsJson = False,
-    out: Annotated[
-        Path,
-        typer.Option(help="Folder for evaluation.json, figures, pictures, and what was flown."),
-    ] = _OUT,
-) -> None:
+        "Also as the field is flown: whole robots, at most 30, as `lpac sim` has them, and points "
+        "from the same pads.",
+    ] = VehicleKind.POINT
+
+
+@app.command()
+@options_of(EvaluateOptions, ConditionOptions)
+def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
     """Policies and baselines over many worlds: how well they cover, with confidence intervals."""
-    given = methods or [str(DEFAULT_BUNDLE)]
+    given = options.methods or [str(DEFAULT_BUNDLE)]
     for path in (part for text in given for part in text.split(",") if "/" in part):
         found(Path(path))
-    from edge.core.wire import PAYLOAD_TYPES
     from lpac.study.file import condition_of
-    from lpac.study.study import BASELINES, Method, Study
+    from lpac.study.study import Study
     from lpac.study.worlds import SET_UPS, WORLD_SETS
 
-    check_px4(vehicle, px4)
-    require_here(vehicle, ray)
-    if compare and len(given) != 2:
-        raise ValueError(f"--compare needs two methods; {len(given)} given")
-    if losses and transports:
-        raise ValueError("--loss and --transport: the model itself says what is lost")
-    if transfer and vehicle is not VehicleKind.POINT:
-        raise ValueError("--transfer has teams that do not fly whole: choose others with --set-up")
-    if transfer and set_ups:
-        raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
-    for option, chosen, known in (
-        ("--set", [world_set], WORLD_SETS), ("--baseline", baselines, BASELINES),
-        ("--set-up", set_ups, tuple(SET_UPS)), ("--payload", payloads, PAYLOAD_TYPES),
-    ):  # fmt: skip
-        for name in chosen or ():
-            if name not in known:
-                raise ValueError(f"{option} {name}: must be one of {', '.join(known)}")
-    calibrated = calibration(wifi, transport=bool(transports))
-    sources = {name: source._asdict() for name, source in calibrated.sources.items()}
-    changes = _changes(
-        losses or [], transports or [], lost or [], lags or [], position_errors or [],
-        [name for name in PAYLOAD_TYPES if name in (payloads or [])], vehicle, calibrated,
-    )  # fmt: skip
-    names = tuple(SET_UPS) if transfer else set_ups or ["field"]
-    policies = [_policy(text, name) for text, name in zip(given, _names(given), strict=True)]
-    flying = [policy.name for policy in policies]
-    policies += [
-        Method.of(name)
-        for name in BASELINES
-        if name not in flying and (not baselines or name in baselines)
+    _check(options, hard, given)
+    calibrated = calibration(hard.wifi, transport=bool(hard.transports))
+    names = tuple(SET_UPS) if options.transfer else options.set_ups or ["field"]
+    conditions = [
+        condition_of({"set_up": name, "duration_s": hard.duration, **change}, "lpac evaluate")
+        for name in names
+        for change in _changes(hard, calibrated)
     ]
-    fly_study(
-        Study(
-            methods=tuple(policies),
-            conditions=tuple(
-                condition_of({"set_up": name, "duration_s": duration, **change}, "lpac evaluate")
-                for name in names
-                for change in changes
-            ),
-            world_set=next(known for known in WORLD_SETS if known == world_set),
-            worlds=worlds,
-            px4_build="" if px4 is None else str(px4.resolve()),
-        ),
-        "evaluation",
-        out,
-        ray,
-        as_json=as_json,
-        compared=compare,
-        further={"wifi_from": sources if transports else None},
+    study = Study(
+        methods=_methods(given, options.baselines),
+        conditions=tuple(conditions),
+        world_set=next(known for known in WORLD_SETS if known == options.world_set),
+        worlds=options.worlds,
+        px4_build="" if options.px4 is None else str(options.px4.resolve()),
     )
-    if transports and not as_json:
+    sources = {name: source._asdict() for name, source in calibrated.sources.items()}
+    fly_study(
+        study, "evaluation", options.out, options.ray, as_json=options.as_json,
+        compared=options.compare, further={"wifi_from": sources if hard.transports else None},
+    )  # fmt: skip
+    if hard.transports and not options.as_json:
         typer.echo("\n".join(["what the model assumes of the Wi-Fi:", *wifi_lines(calibrated)]))
 
 
-def _changes(
-    losses: Sequence[float],
-    transports: Sequence[str],
-    lost: Sequence[str],
-    lags_s: Sequence[float],
-    position_errors_m: Sequence[float],
-    payloads: Sequence[str],
-    vehicle: VehicleKind,
-    calibrated: "Calibration",
-) -> list[dict[str, Any]]:
+def _check(options: EvaluateOptions, hard: ConditionOptions, given: Sequence[str]) -> None:
+    """Raise ValueError for what cannot be evaluated."""
+    from edge.core.wire import PAYLOAD_TYPES
+    from lpac.study.study import BASELINES
+    from lpac.study.worlds import SET_UPS, WORLD_SETS
+
+    check_px4(hard.vehicle, options.px4)
+    require_here(hard.vehicle, options.ray)
+    if options.compare and len(given) != 2:
+        raise ValueError(f"--compare needs two methods; {len(given)} given")
+    if hard.losses and hard.transports:
+        raise ValueError("--loss and --transport: the model itself says what is lost")
+    if options.transfer and hard.vehicle is not VehicleKind.POINT:
+        raise ValueError("--transfer has teams that do not fly whole: choose others with --set-up")
+    if options.transfer and options.set_ups:
+        raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
+    for option, chosen, known in (
+        ("--set", [options.world_set], WORLD_SETS),
+        ("--baseline", options.baselines, BASELINES),
+        ("--set-up", options.set_ups, tuple(SET_UPS)),
+        ("--payload", hard.payloads, PAYLOAD_TYPES),
+    ):
+        for name in chosen or ():
+            if name not in known:
+                raise ValueError(f"{option} {name}: must be one of {', '.join(known)}")
+
+
+def _methods(given: Sequence[str], baselines: Sequence[str] | None) -> "tuple[Method, ...]":
+    """Those that are given, and behind them the baselines. Raises BundleError."""
+    from lpac.study.study import BASELINES, Method
+
+    methods = [
+        Method.of(text) if text in BASELINES else Method.of(name, *text.split(","))
+        for text, name in zip(given, _names(given), strict=True)
+    ]
+    named = [method.name for method in methods]
+    wanted = [name for name in BASELINES if not baselines or name in baselines]
+    return (*methods, *(Method.of(name) for name in wanted if name not in named))
+
+
+def _changes(hard: ConditionOptions, calibrated: "Calibration") -> list[dict[str, Any]]:
     """The keys of each condition, as a study has them; the first is as usual."""
+    from edge.core.wire import PAYLOAD_TYPES
+
     wifi = asdict(calibrated.wifi)
     lossy: list[dict[str, Any]] = [
-        *({"loss": loss} for loss in losses),
+        *({"loss": loss} for loss in hard.losses or ()),
         *(
             {"radio": {"transport": transport_named(name), "wifi": wifi}}
-            for name in dict.fromkeys(transports)
+            for name in dict.fromkeys(hard.transports or ())
         ),
     ]
-    whole: list[dict[str, Any]]
-    whole = [] if vehicle is VehicleKind.POINT else [{"from_pads": True}, {"engine": vehicle.value}]
+    payloads = [name for name in PAYLOAD_TYPES if name in (hard.payloads or ())]
+    whole: list[dict[str, Any]] = [{"from_pads": True}, {"engine": hard.vehicle.value}]
     return [
         {},
         *lossy,
-        *({"lost": robots} for robots in lost),
-        *({"lag_s": lag_s} for lag_s in lags_s),
-        *({"position_error_m": error_m} for error_m in position_errors_m),
+        *({"lost": robots} for robots in hard.lost or ()),
+        *({"lag_s": lag_s} for lag_s in hard.lags or ()),
+        *({"position_error_m": error_m} for error_m in hard.position_errors or ()),
         *({"payload": payload, **loss} for payload in payloads for loss in ({}, *lossy)),
-        *whole,
+        *(whole if hard.vehicle is not VehicleKind.POINT else ()),
     ]
 
 
@@ -232,10 +239,3 @@ def _names(given: Sequence[str]) -> list[str]:
         if len(set(names)) == len(set(given)):
             break
     return names
-
-
-def _policy(text: str, name: str) -> "Method":
-    """A baseline by its name, or bundles by their paths. Raises BundleError."""
-    from lpac.study.study import BASELINES, Method
-
-    return Method.of(text) if text in BASELINES else Method.of(name, *text.split(","))

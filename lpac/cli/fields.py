@@ -3,9 +3,10 @@
 import inspect
 from collections.abc import Callable
 from copy import copy
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, Field, fields, make_dataclass
+from enum import StrEnum
 from functools import wraps
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 from typer.models import ArgumentInfo, OptionInfo
@@ -34,6 +35,8 @@ def options_of(*classes: type[Any]) -> Callable[[Callable[..., None]], Callable[
 
             for name, value in given.items():
                 require(hints[name], value, flags[name])
+                if _choices(hints[name]) and value is not None:
+                    given[name] = str(value)
             command(*(cls(**_own(cls, given)) for cls in classes))
 
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -41,6 +44,26 @@ def options_of(*classes: type[Any]) -> Callable[[Callable[..., None]], Callable[
         return called
 
     return decorate
+
+
+def chosen(cls: type[Any], *names: str, **flags: str) -> type[Any]:
+    """A dataclass of some fields alone; `flags` name their options otherwise."""
+    hints, defaults = _hints(cls), {each.name: each.default for each in fields(cls)}
+    own = []
+    for name in (*names, *flags):
+        hint: Any = hints[name]
+        if name in flags:
+            [text] = [each for each in hint.__metadata__ if isinstance(each, str)]
+            hint = Annotated[hint.__origin__, typer.Option(flags[name], help=text)]
+        own.append((name, hint, defaults[name]))
+    return make_dataclass(f"Chosen{cls.__name__}", own, frozen=True, kw_only=True)
+
+
+def flag_of(name: str) -> str:
+    """The option of a field that has no other name."""
+    for unit in _UNITS:
+        name = name.removesuffix(unit)
+    return f"--{name.replace('_', '-')}"
 
 
 def _hints(cls: type[Any]) -> dict[str, Any]:
@@ -58,31 +81,42 @@ def _parameter(cls: type[Any], of: Field[Any]) -> inspect.Parameter:
     [info] = [each for each in metadata if isinstance(each, OptionInfo | ArgumentInfo | str)]
     if isinstance(info, str):
         info = typer.Option(help=info)
-    if isinstance(info, OptionInfo) and info.default is ...:
-        info = copy(info)
-        # Beside a type this is what typer takes for the option's first name.
-        info.default = _flag(of.name)
     default = of.default if of.default_factory is MISSING else of.default_factory()
+    if isinstance(info, OptionInfo) and info.default is ...:
+        info, flag = copy(info), flag_of(of.name)
+        # Beside a type this is what typer takes for the option's first name.
+        info.default = f"{flag}/--no-{flag[2:]}" if default is True else flag
     return inspect.Parameter(
         of.name,
         inspect.Parameter.KEYWORD_ONLY,
         default=inspect.Parameter.empty if default is MISSING else default,
-        annotation=Annotated[_without_bounds(hint), info],
+        annotation=Annotated[_plain(hint, of.name), info],
     )
 
 
-def _flag(name: str) -> str:
-    for unit in _UNITS:
-        name = name.removesuffix(unit)
-    return f"--{name.replace('_', '-')}"
+def _choices(hint: Any) -> tuple[str, ...]:
+    """The values of a field that has few; none of others."""
+    if get_origin(hint) in (Annotated,):
+        return _choices(hint.__origin__)
+    if get_origin(hint) is Literal:
+        return tuple(get_args(hint))
+    return tuple(choice for each in get_args(hint) for choice in _choices(each))
+
+
+def _plain(hint: Any, name: str) -> Any:
+    """The type as typer knows it."""
+    choices = _choices(hint)
+    if choices:
+        kind: Any = StrEnum(name, {choice: choice for choice in choices})  # type: ignore[misc]
+        return kind | None if type(None) in get_args(_without_bounds(hint)) else kind
+    return _without_bounds(hint)
 
 
 def _without_bounds(hint: Any) -> Any:
-    """The type that typer knows."""
     if get_origin(hint) is Annotated:
         return _without_bounds(hint.__origin__)
     arguments = get_args(hint)
-    if any(get_origin(each) is Annotated for each in arguments):
-        plain = [_without_bounds(each) for each in arguments]
-        return plain[0] | plain[1] if len(plain) > 1 else hint
+    if type(None) in arguments:
+        [kind] = [_without_bounds(each) for each in arguments if each is not type(None)]
+        return kind | None
     return hint

@@ -36,6 +36,7 @@ Ray = Annotated[
 DEFAULT_FLEET = Path("fleet.toml")
 DEFAULT_BUNDLE = SHIPPED_BUNDLE
 DEFAULT_SENSOR = "world"
+DEFAULT_ROBOTS = 10
 # The name of a lock has some hundred bytes.
 _LOCK_BYTES = 80
 

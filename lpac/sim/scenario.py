@@ -35,70 +35,99 @@ MAX_ROBOTS = MAX_ROBOT_ID + 1
 _INPUT_AGE_S = 1.0
 
 
+class UnableError(ValueError):
+    """An engine cannot do what a field of a scenario asks for."""
+
+    def __init__(self, engine: str, name: str, value: object, default: object) -> None:
+        super().__init__(
+            f"{name} = {value}: must be {default} for {engine}, which know nothing of it"
+        )
+        self.name = name
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario(Bounded):
     """One flight: who flies what, over which world, and what is wrong with it.
 
     Everything random follows from `seed`, but for the timing of programs in real time. All engines
-    fly it: points (`lpac.sim.experiment`, `lpac.sim.batch`), whole robots on a simulated clock
-    (`lpac.sim.fleet.clocked`), and as programs on simulated vehicles or PX4s
-    (`lpac.sim.fleet.flight`). An engine refuses what it cannot do.
+    fly it (`lpac.sim.engines`); an engine refuses what it cannot do.
 
     World, in model units: without `features` there are `random_feature_count` Gaussian ones,
-    `random_feature_sigma` (least, greatest) wide. `world_size` and `communication_range` are the
-    bundle's where they are None.
+    `random_feature_sigma` (least, greatest) wide.
 
     Team: `starts_m` is one position in the mission frame per robot; else points start anywhere in
     the world, and whole robots where there is room. `failures` are robots that are away: points
-    fail, whole robots are taken out of the fence by a pilot. Ages and `payload` are those of
-    `PacParameters`, and `clocks` the periods of the robots' loops. Where `max_input_age_s` is None,
-    inputs count for two of the longest periods, and for 1 s at least.
+    fail, whole robots are taken out of the fence by a pilot. `clocks` are the periods of the
+    robots' loops. Where `max_input_age_s` is None, inputs count for two of the longest periods, and
+    for 1 s at least.
 
-    Radio: `loss` is the probability that a message is lost, `delay_s` how late it is on average; of
-    whole robots from the mission's start on.
+    Points alone: `max_speed_m_s` is the bundle's where it is None; `position_bias` is, per robot
+    and in model units, how wrong its position is, to which the error of `position_error_m` is
+    added; with a `radio` its model says what is lost and late.
 
-    Points alone: `controller` may be a baseline, which knows true positions and needs no radio;
-    `max_speed_m_s` is the bundle's where it is None; `position_bias` is, per robot and in model
-    units, how wrong its position is, to which an error of the standard deviation `position_error_m`
-    along each axis is added; vehicles follow a velocity with the time constant `lag_s`; with a
-    `radio` its model says what is lost and late.
-
-    Whole robots alone: without `errors` their estimates are off by noise alone, and there is no
-    wind; `wind_m_s` is the mean wind, drawn from the seed where it is None, with gusts of up to
-    8 m/s; `budget` is the error they allow for; `sensor` the `type` in robot.toml's [sensor]; with
-    `secure` the fleet has keys; `transport` is that of fleet.toml's [radio].
+    Whole robots alone: `budget` is the error that they allow for.
 
     Raises ValueError that names what is impossible.
     """
 
-    controller: Controller = "lpac"
-    robots: Annotated[int, Meta(ge=1, le=MAX_ROBOTS)] = 10
-    seed: Annotated[int, Meta(ge=0)] = 0
-    duration_s: Positive = 60.0
+    controller: Annotated[
+        Controller,
+        "What decides where robots fly: lpac, which is the bundle's policy, or a baseline.",
+    ] = "lpac"
+    robots: Annotated[int, Meta(ge=1, le=MAX_ROBOTS), "Number of robots."] = 10
+    seed: Annotated[
+        int, Meta(ge=0), "World, starts, clocks, losses and vehicles' errors follow from it."
+    ] = 0
+    duration_s: Annotated[Positive, "Flight time, s; of whole robots that of the mission."] = 60.0
     features: Features | None = None
-    random_feature_count: Annotated[int, Meta(ge=0)] = 10
+    random_feature_count: Annotated[int, Meta(ge=0), "Features of a random world."] = 10
     starts_m: tuple[tuple[Finite, Finite], ...] | None = None
     scale: ModelScale = FIELD_SCALE
-    loss: Share = 0.0
-    delay_s: NonNegative = 0.0
+    loss: Annotated[
+        Share, "Probability that a message is lost; of whole robots from the mission's start on."
+    ] = 0.0
+    delay_s: Annotated[
+        NonNegative, "Mean delay of a message, s; of whole robots from the mission's start on."
+    ] = 0.0
     radio: ModelledRadio | None = None
-    max_message_age_s: NonNegative = 0.8
+    max_message_age_s: Annotated[
+        NonNegative, "Older messages are not used, s; 0: each is used once."
+    ] = 0.8
     max_input_age_s: NonNegative | None = None
-    payload: PayloadType = "float16"
+    payload: Annotated[PayloadType, "Points: number type in messages."] = "float16"
     random_feature_sigma: tuple[Positive, Positive] = (40.0, 60.0)
-    world_size: AtLeastOne | None = None
-    communication_range: Positive | None = None
+    world_size: Annotated[
+        AtLeastOne | None, "Side of the world, in model units; else the bundle's."
+    ] = None
+    communication_range: Annotated[
+        Positive | None, "How far robots are heard, in model units; else the bundle's."
+    ] = None
     max_speed_m_s: Positive | None = None
-    lag_s: NonNegative = 0.0
+    lag_s: Annotated[NonNegative, "Points: time constant by which robots follow a velocity, s."] = (
+        0.0
+    )
     position_bias: tuple[tuple[Finite, Finite], ...] | None = None
-    position_error_m: NonNegative = 0.0
+    position_error_m: Annotated[
+        NonNegative,
+        "Points: how wrong robots are about where they are: standard deviation along each axis, m.",
+    ] = 0.0
     failures: tuple[Failure, ...] = ()
     clocks: Clocks = field(default_factory=Clocks)
-    errors: bool = True
-    wind_m_s: NonNegative | None = None
+    errors: Annotated[
+        bool,
+        "Whole robots: with errors of positions, heights, compasses and batteries, and in wind.",
+    ] = True
+    wind_m_s: Annotated[
+        NonNegative | None,
+        "Whole robots: the mean wind, m/s, with gusts of up to 8 m/s; else it is drawn.",
+    ] = None
     budget: ErrorBudget = ERRORS
-    sensor: str = WORLD_SENSOR
-    secure: bool = False
+    sensor: Annotated[str, "Whole robots: the type of their sensor."] = WORLD_SENSOR
+    secure: Annotated[
+        bool,
+        "Whole robots: robots and ground are members of a fleet, with keys that are made for it: "
+        "what they say is signed, and nobody else is heard.",
+    ] = False
     transport: Transport = "mesh"
 
     def check_rules(self) -> None:
@@ -158,14 +187,11 @@ class Scenario(Bounded):
         )
 
     def require_default(self, engine: str, *names: str) -> None:
-        """Raise ValueError if one of these fields asks for what this engine cannot do."""
+        """Raise UnableError if one of these fields asks for what this engine cannot do."""
         for name in names:
-            default = getattr(_DEFAULT, name)
-            if getattr(self, name) != default:
-                raise ValueError(
-                    f"{name} = {getattr(self, name)}: must be {default} for {engine}, which know "
-                    "nothing of it"
-                )
+            value, default = getattr(self, name), getattr(_DEFAULT, name)
+            if value != default:
+                raise UnableError(engine, name, value, default)
 
 
 _DEFAULT = Scenario()

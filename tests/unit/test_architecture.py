@@ -77,7 +77,7 @@ ALLOWED = {
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.extras", "lpac.shipped",
         "lpac.analysis", "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch",
-        "lpac.study", "lpac.train", "lpac.ablate", "lpac.paper",
+        "lpac.sim.engines", "lpac.study", "lpac.train", "lpac.ablate", "lpac.paper",
         "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
         "lpac.radio.heat_map", "lpac.middleware",
     },

@@ -25,7 +25,7 @@ from tests.conftest import SHIPPED
         ({"transports": ["mesh"], "losses": [0.1]}, "--loss and --transport: the model itself"),
         ({"wifi": Path("wifi.toml")}, "--wifi does nothing without --transport"),
         ({"transports": ["mesh"], "wifi": Path("w.yaml")}, "w.yaml: must be a .toml file"),
-        ({"worlds": 0}, "worlds = 0: must be at least 1"),
+        ({"worlds": 0}, "--worlds = 0: must be at least 1"),
         ({"methods": ["frontier-cvt"], "compare": True}, "--compare needs two methods; 1 given"),
         ({"methods": [str(SHIPPED)] * 2}, "each once"),
     ],

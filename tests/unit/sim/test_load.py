@@ -3,8 +3,9 @@
 import pytest
 from typer.testing import CliRunner
 
+from lpac.cli import programs
 from lpac.cli import sim as cli
-from lpac.cli.sim import _as_many_as_carried, _say_if_carried
+from lpac.cli.programs import as_many_as_carried, say_if_carried
 from lpac.sim.fleet import load
 from lpac.sim.fleet.processes import Backlog, OverloadError
 from tests.conftest import SHIPPED
@@ -22,7 +23,7 @@ def test_as_many_robots_fly_as_the_machine_carries(
     robots: int,
 ) -> None:
     monkeypatch.setattr(load, "_units_per_s", lambda _: units_per_s)
-    assert _as_many_as_carried(SHIPPED, "mavlink") == robots
+    assert as_many_as_carried(SHIPPED, "mavlink") == robots
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f": flying {robots}")
 
@@ -43,8 +44,10 @@ def test_programs_fly_as_many_as_the_machine_carries_unless_it_is_said_how_many(
 ) -> None:
     flown: list[int] = []
     monkeypatch.setattr(load, "_units_per_s", lambda _: FIVE_FLEW)
-    for fly in ("_launch", "_serve", "_fly_on_clock"):
-        monkeypatch.setattr(cli, fly, lambda scenario, *_, **__: flown.append(scenario.robots))
+    monkeypatch.setattr(cli, "_fly_on_clock", lambda scenario, _: flown.append(scenario.robots))
+    monkeypatch.setattr(cli, "_show_fleet_flight", lambda *_: None)
+    for fly in ("fly_script", "serve"):
+        monkeypatch.setattr(programs, fly, lambda of: flown.append(of.scenario.robots))
     result = CliRunner().invoke(cli.app, options)
     assert (result.exit_code, flown) == (0, [robots]), result.output
 
@@ -53,10 +56,10 @@ def test_who_asks_for_more_is_warned(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(load, "_units_per_s", lambda _: FIVE_FLEW)
-    assert _say_if_carried(5, SHIPPED, "mavlink") == 5
+    assert say_if_carried(5, SHIPPED, "mavlink") == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("carries about 5 of these robots and vehicles")
-    assert _say_if_carried(6, SHIPPED, "mavlink") == 5
+    assert say_if_carried(6, SHIPPED, "mavlink") == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert (
         "carries about 5 of these robots" in line
