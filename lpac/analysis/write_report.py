@@ -4,18 +4,29 @@ Apart from what it is of, which draws nothing: what draws takes a second to load
 """
 
 import json
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
+from typing import NamedTuple
 
+from edge.core.counted import counted
 from lpac.analysis import figures, style
 from lpac.analysis.examination import Examined
-from lpac.analysis.flight import LOOPS, FlightRecord
+from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness, RobotRecord
 from lpac.analysis.logs import Progress
-from lpac.analysis.page import Drawn, page
+from lpac.analysis.template import render
 
 PAGE = "report.html"
 SUMMARY = "report.json"
+
+
+class Drawn(NamedTuple):
+    """A flight's record, and its figures: PNG by name."""
+
+    record: FlightRecord
+    figures: Mapping[str, bytes]
 
 
 def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Progress) -> Path:
@@ -37,6 +48,29 @@ def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Pro
     text = page(f"Flight report: {names}", drawn, repeatability, examined.notes)
     (out / PAGE).write_bytes(text.encode(errors="backslashreplace"))
     return out / PAGE
+
+
+def page(
+    title: str, drawn: Sequence[Drawn], repeatability: bytes | None, notes: Iterable[str]
+) -> str:
+    """The page's HTML, which holds everything."""
+    return render(
+        "lpac.analysis", "report.html", title=title, drawn=drawn, repeatability=repeatability,
+        notes=notes, loops={loop: f"{loop} late, 99 % / max" for loop in LOOPS}, late=_late,
+        local=_local, known=_known, counted=counted,
+    )  # fmt: skip
+
+
+def _late(record: FlightRecord, robot: RobotRecord) -> list[LoopLateness | None]:
+    return [record.lateness[loop].get(robot.name) for loop in LOOPS]
+
+
+def _local(unix_s: float) -> datetime:
+    return datetime.fromtimestamp(unix_s).astimezone()
+
+
+def _known(form: str, value: float) -> str:
+    return form.format(value) if math.isfinite(value) else ""
 
 
 def _slug(name: str, taken: set[str]) -> str:

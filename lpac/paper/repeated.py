@@ -1,11 +1,9 @@
 """The paper, repeated: what its experiments left in a folder, as one page that holds everything."""
 
-import html
 import itertools
 import json
-import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,18 +11,13 @@ from typing import Any
 import numpy as np
 
 from edge.policy.bundle import Bundle
-from lpac.analysis.page import CLOSING, figure, opening
-from lpac.paper.claims import Agreement, Claim, Effort, Experiments, Sizes, claims_of
+from lpac.analysis.template import render
+from lpac.paper.claims import Claim, Effort, Experiments, Sizes, claims_of
 from lpac.study.hearing_robot import HearingRobot, message_bytes
 
-_NARROW = ("staleness",)
 # Of which the median is how long one takes.
 _STEPS = 100
 TITLE = "The paper, repeated"
-_PAPER = (
-    "Agarwal, Vatnsdal, Garcia Camargo, Kumar, Ribeiro: “A Scalable Multi-Robot Framework for "
-    "Decentralized and Asynchronous Perception-Action-Communication Loops”"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +98,15 @@ def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, 
     }
     (folder / "claims.json").write_text(json.dumps(told, indent=2) + "\n")
     path = folder / "index.html"
-    flown = {name: document["flown"] for name, document in documents.items()}
-    path.write_text(_page(folder, claims, flown, made_by))
+    chapters = [chapter for chapter in CHAPTERS if chapter.name in documents]
+    path.write_text(
+        render(
+            "lpac.paper", "repeated.html", title=TITLE, claims=claims, chapters=chapters,
+            flown={name: document["flown"] for name, document in documents.items()},
+            made_by=made_by, pictures={chapter.name: _pictures(folder, chapter)
+                                       for chapter in chapters},
+        )
+    )  # fmt: skip
     return path
 
 
@@ -134,60 +134,7 @@ def _claim_json(claim: Claim) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _page(
-    folder: Path,
-    claims: Sequence[Claim],
-    flown: Mapping[str, str],
-    made_by: Mapping[str, Mapping[str, str]],
-) -> str:
-    parts = [
-        opening(TITLE),
-        f"<p>{_text(_PAPER)}: each of its claims, figures and tables, and the result here. "
-        "Everything was simulated: no real robot has flown.</p>",
-        _verdicts(claims),
-        *itertools.starmap(_said, enumerate(claims)),
-    ]
-    for chapter in CHAPTERS:
-        if chapter.name not in made_by:
-            continue
-        its = folder / chapter.name
-        parts.append(f'<h2 id="{chapter.name}">{_text(chapter.title)}</h2>')
-        parts.append(f"<p>{_text(flown[chapter.name])}</p>")
-        parts += [
-            figure((its / f"{name}.png").read_bytes(), caption, narrow=name in _NARROW)
-            for name, caption in chapter.figures.items()
-            if (its / f"{name}.png").exists()
-        ]
-        said = "; ".join(f"{what}: {value}" for what, value in made_by[chapter.name].items())
-        parts.append(
-            f'<p class="quiet">{_text(said)}. The command leaves data and figures for print in '
-            f"{chapter.name}/.</p>"
-        )
-    return "\n".join([*parts, CLOSING]) + "\n"
-
-
-def _verdicts(claims: Sequence[Claim]) -> str:
-    rows = (
-        f'<tr><td><a href="#claim-{number}">{_text(claim.name)}</a></td>'
-        f"<td>{_verdict(claim.verdict)}</td></tr>"
-        for number, claim in enumerate(claims)
-    )
-    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
-
-
-def _said(number: int, claim: Claim) -> str:
-    return (
-        f'<h3 id="claim-{number}">{_text(claim.name)}: {_verdict(claim.verdict)}</h3>'
-        f"<p>The paper: {_text(claim.paper)}</p><p>Here: {_text(claim.ours)}</p>"
-        f'<p class="quiet">Rule: {_text(claim.rule)}</p>'
-    )
-
-
-def _verdict(verdict: Agreement) -> str:
-    bad = verdict in (Agreement.DIFFERS, Agreement.MISTAKE)
-    return f'<span class="bad">{verdict.value}</span>' if bad else verdict.value
-
-
-def _text(text: str) -> str:
-    """As HTML; what is between backticks is code."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+def _pictures(folder: Path, chapter: Chapter) -> dict[str, bytes]:
+    """PNG by figure, of those that were drawn."""
+    paths = {name: folder / chapter.name / f"{name}.png" for name in chapter.figures}
+    return {name: path.read_bytes() for name, path in paths.items() if path.exists()}

@@ -4,11 +4,10 @@ import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from lpac.analysis.template import render
 
 
 class Table(NamedTuple):
@@ -53,7 +52,7 @@ class Report:
         (folder / f"{self.name}.json").write_text(json.dumps(document, indent=2) + "\n")
         write_csv(self.rows, folder / f"{self.name}.csv")
         told = {name: getattr(self, name) for name in self.__slots__}
-        (folder / "README.md").write_text(_environment().get_template("report.md").render(told))
+        (folder / "README.md").write_text(render("lpac.study", "report.md", **told))
         return document
 
 
@@ -61,18 +60,3 @@ def write_csv(rows: Sequence[Sequence[object]], path: Path) -> None:
     """Raises OSError."""
     with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
-
-
-@cache
-def _environment() -> Environment:
-    made = Environment(
-        loader=PackageLoader("lpac.study"), undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
-    made.filters["cell"] = _cell
-    return made
-
-
-def _cell(text: str) -> str:
-    """On one line; a vertical line would begin another cell."""
-    return text.replace("-\n", "").replace("\n", " ").replace("|", "&#124;")

@@ -31,10 +31,9 @@ from lpac.analysis.examination import Examined, Wanted, examine
 from lpac.analysis.figures import overview
 from lpac.analysis.logs import read_logs
 from lpac.analysis.missions import find_missions, whole_record
-from lpac.analysis.page import Drawn, page
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.style import CURVES, SWARM, save
-from lpac.analysis.write_report import write
+from lpac.analysis.write_report import Drawn, page, write
 from lpac.cli.main import app
 from lpac.ground.record import TOPICS, GroundMetadata
 from tests.conftest import SHIPPED
