@@ -12,6 +12,7 @@ from edge.policy.bundle import Bundle
 from lpac.analysis import style
 from lpac.analysis.figures import snapshots_and_costs
 from lpac.analysis.style import WIDTH_IN, tidy
+from lpac.analysis.template import render
 from lpac.sim.baselines import BaselineName
 from lpac.study.flights import records_of
 from lpac.study.study import Method
@@ -57,7 +58,8 @@ def write_card(card: ModelCard, folder: Path, bundle: Bundle, path: Path) -> Non
     style.save(_costs(card), figures / "costs")
     if CLAIRVOYANT in card.baselines:
         _write_worlds(card, figures, bundle, path)
-    write_atomically(folder / "README.md", _text(card).encode())
+    text = render("lpac.train", "card.md", card=card, clairvoyant=CLAIRVOYANT)
+    write_atomically(folder / "README.md", text.encode())
 
 
 def _write_worlds(card: ModelCard, figures: Path, bundle: Bundle, path: Path) -> None:
@@ -121,83 +123,3 @@ def _costs(card: ModelCard) -> Figure:
         tidy(axes)
         figure.legend(loc="outside right center", fontsize=7)
         return figure
-
-
-def _text(card: ModelCard) -> str:
-    config, best = card.config, card.best
-    data, select, dagger = config.data, config.select, config.dagger
-    name = config.export.name
-    flown = sum(facts["flights"] for facts in card.shards.values())
-    states = sum(facts["states"] for facts in card.shards.values())
-    robots = sum(facts["robots"] for facts in card.shards.values())
-    shown = """
-The first validation world, and the worst:
-
-![first](figures/first-world.png)
-![worst](figures/worst-world.png)
-"""
-    rows = [f"| **{name}** | {_row(best.cost)} |"]
-    rows += [f"| {name}, with int8 payloads | {_row(card.int8)} |"]
-    rows += [f"| {each} | {_row(cost)} |" for each, cost in card.baselines.items()]
-    trained = ", ".join(
-        f"{_least_most(worlds.robots)} robots in {_least_most(worlds.world_size)} units, range "
-        f"{_least_most(worlds.communication_range)}"
-        for worlds in data.worlds
-    )
-    begun = config.fit.begin_with
-    begins = f"It began with `{begun}`'s weights." if begun else "It began with random weights."
-    judged = (
-        f"`lpac evaluate {name}` on others shows"
-        if CLAIRVOYANT in card.baselines
-        else ("only others show")
-    )
-    return f"""# {name}
-
-A policy of the family `{config.network.get("family", "lpac")}`, bundle `{card.bundle_id}`.
-Licence: {config.export.licence}. `{name}.pt` is the checkpoint, `{name}/` the bundle,
-`config.toml` what both were made of (digest `{card.digest}`).
-
-## Data
-
-{states} states of swarms, {robots} of robots, from {flown} flights over worlds of the training set,
-seed {config.seed}; the expert is {card.expert}. In round 0 it flew, then the policy
-in {dagger.rounds} DAgger rounds. Worlds: {trained}. Flown at
-{data.scale.env_scale * data.scale.velocity_scale:g} times the policy's velocities.
-
-## Training
-
-{begins} {len(card.losses)} epochs in all, on {card.device}; the loss came to
-{card.losses[-1].loss:.3f} of the variance of round 0's actions. Hours:
-{card.generate_hours:.2f} of CPU to make the data, {card.fit_hours:.2f} to fit,
-{card.select_hours:.2f} to select. Versions:
-{", ".join(f"{each} {number}" for each, number in card.versions.items())}.
-
-![losses](figures/losses.png)
-
-## Results
-
-Chosen among {len(card.judged)} candidates by the mean cost over {select.worlds} validation worlds
-({", ".join(select.set_ups)}; {select.duration_s:g} s; {100.0 * select.loss:g} % of messages lost):
-round {best.candidate.round}, epoch {best.candidate.epoch}. Cost at the end over that at the start:
-
-| | mean | p90 | worst |
-| --- | --- | --- | --- |
-{chr(10).join(rows)}
-
-![costs](figures/costs.png)
-{shown if CLAIRVOYANT in card.baselines else ""}
-## Limits
-
-It was chosen by these worlds, so they flatter it: {judged} how good
-it is. One training seed says nothing about a method. Point robots flew: none of this was measured
-on vehicles. Numbers of robots, ranges and worlds other than those above are untried.
-"""
-
-
-def _row(cost: ClosedLoopCost) -> str:
-    return f"{cost.mean:.3f} | {cost.p90:.3f} | {cost.worst:.3f}"
-
-
-def _least_most(values: Sequence[float]) -> str:
-    least, most = values
-    return f"{least:g}" if least == most else f"{least:g} to {most:g}"
