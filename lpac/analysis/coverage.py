@@ -10,6 +10,7 @@ from edge.core import F32, F64
 from edge.core.coverage import cell_corners, coverage_cost, voronoi_cells
 from edge.core.world import Feature, parse_world, rasterize
 from edge.messages.mission import STEERED, FlightState, RobotStatus
+from lpac.analysis.mission_tracker import MissionStatus
 from lpac.analysis.snapshot import FleetSnapshot
 
 # With the positions that are given, ten.
@@ -141,16 +142,7 @@ class Whereabouts:
         return flying or known
 
 
-class Flying(Protocol):
-    """What tells whether a robot is in the air: a `RobotStatus`, or a part of it."""
-
-    @property
-    def state(self) -> FlightState: ...
-    @property
-    def armed(self) -> bool | None: ...
-
-
-def in_air(status: Flying) -> bool:
+def in_air(status: MissionStatus) -> bool:
     """Whether the robot flies, as far as it says."""
     if status.state in (FlightState.PILOT, FlightState.LAND):
         return bool(status.armed)

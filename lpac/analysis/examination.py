@@ -4,7 +4,7 @@ import contextlib
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,24 +21,15 @@ _MOST_NOTES = 3  # in one line
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """What `Coverage` needs."""
-
-    world: str
-    world_id: str
-    world_size: int
-    env_scale: float
-    truncation: float
-    norm: float
-
-
-class _Sizes(NamedTuple):
-    """Of the policy's world; see `Setup`."""
+    """A policy's world, as `FleetSetup` has it, and the text of the one that was flown over."""
 
     world_size: int
     sensor_size: int
     env_scale: float
     truncation: float
     norm: float
+    world: str = ""
+    world_id: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +132,7 @@ class _Worlds:
             with contextlib.suppress(OSError, UnicodeDecodeError):
                 text = path.read_text("utf-8-sig")
                 self._texts.setdefault(id_of(text), text)
-        self._coverages: dict[tuple[str, _Sizes], Coverage] = {}
+        self._coverages: dict[_World, Coverage] = {}
 
     def of(self, mission: Mission) -> tuple[Coverage | None, int]:
         """The world that the mission's robots flew over; None, with a note, if it is not known.
@@ -155,10 +146,10 @@ class _Worlds:
             for said in self._logs.statuses[robot]
             if mission.begin_s <= said.time_s <= mission.end_s
         ]
-        sizes = self._sizes(mission, {s.bundle_id for s in said})
-        return self._coverage(mission, sorted({s.world_id for s in said}), sizes), sizes.sensor_size
+        world = self._without_text(mission, {s.bundle_id for s in said})
+        return self._coverage(mission, sorted({s.world_id for s in said}), world), world.sensor_size
 
-    def _coverage(self, mission: Mission, flown: list[str], sizes: _Sizes) -> Coverage | None:
+    def _coverage(self, mission: Mission, flown: list[str], world: _World) -> Coverage | None:
         if len(flown) > 1:
             self._notes.append(
                 f"{mission.name}: the robots flew over several worlds: {', '.join(flown)}"
@@ -177,20 +168,18 @@ class _Worlds:
                 f"give it with {self._world_option}"
             )
             return None
-        name = id_of(text)
-        if (name, sizes) not in self._coverages:
-            self._coverages[name, sizes] = Coverage.of(
-                _World(text, name, sizes.world_size, sizes.env_scale, sizes.truncation, sizes.norm)
-            )
-        return self._coverages[name, sizes]
+        world = replace(world, world=text, world_id=id_of(text))
+        if world not in self._coverages:
+            self._coverages[world] = Coverage.of(world)
+        return self._coverages[world]
 
-    def _sizes(self, mission: Mission, bundle_ids: set[str]) -> _Sizes:
+    def _without_text(self, mission: Mission, bundle_ids: set[str]) -> _World:
         """From the ground's log of the policies that were flown, else from a policy's bundle."""
         setups = [told for told in self._logs.setups if told[1].bundle_id in bundle_ids]
         if setups and self._bundle is None:
             before = [setup for at_s, setup in setups if at_s <= mission.end_s]
             setup = before[-1] if before else setups[0][1]
-            return _Sizes(
+            return _World(
                 setup.world_size, setup.sensor_size, setup.env_scale, setup.truncation, setup.norm
             )
         env_scale = 16.0
@@ -200,26 +189,26 @@ class _Worlds:
                 env_scale = float(_policy(metadata.configuration).get("env_scale", env_scale))
                 places.append(Path(metadata.bundle_path))
         if self._bundle is not None:
-            return _sizes_of(self._bundle, load_bundle(self._bundle), env_scale)
+            return _world_of(self._bundle, load_bundle(self._bundle), env_scale)
         for place in dict.fromkeys(places):
             with contextlib.suppress(BundleError, OSError):
                 bundle = load_bundle(place)
                 if bundle.id in bundle_ids:  # There may be another one by now.
-                    return _sizes_of(place, bundle, env_scale)
-        sizes = _Sizes(512, 64, env_scale, 2.0, 1.0)
+                    return _world_of(place, bundle, env_scale)
+        world = _World(512, 64, env_scale, 2.0, 1.0)
         self._notes.append(
             f"{mission.name}: the policy's bundle is not here (give it with --bundle): assumed are "
-            f"a world of {sizes.world_size} cells and a sensor of {sizes.sensor_size}"
+            f"a world of {world.world_size} cells and a sensor of {world.sensor_size}"
         )
-        return sizes
+        return world
 
 
-def _sizes_of(place: Path, bundle: Bundle, env_scale: float) -> _Sizes:
+def _world_of(place: Path, bundle: Bundle, env_scale: float) -> _World:
     """Raises BundleError if the bundle has no perception."""
     perception, training = bundle.manifest.perception, bundle.manifest.training
     if perception is None:
         raise BundleError(f"{place}: the bundle has no perception")
-    return _Sizes(
+    return _World(
         perception.world_size, perception.sensor_size, env_scale, training.idf_truncation,
         training.idf_norm,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from edge.core import F64
 from edge.messages.mission import FlightState
 from lpac.analysis import style
-from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness, Messages, RobotRecord
+from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness, Messages, RobotRecord, quantile
 from lpac.analysis.style import FAINT, GREY, INK, WIDTH_IN, tidy
 
 SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a mission's duration
@@ -23,7 +23,7 @@ _RISES = "It may rise at first: robots leave what\nthey cover, to see what nobod
 _RISE = 0.05
 LLOYD = "Lloyd, knowing the whole world"
 _MUCH_MS, _MUCH_LOSS = 200.0, 10.0
-_MOST_NAMES, _MOST_TICKS, _MOST_STATES_IN_ROW = 12, 8, 7
+_MOST_NAMES, _MOST_SMALL_NAMES, _MOST_TICKS, _MOST_STATES_IN_ROW = 12, 32, 8, 7
 _LONGEST_IN_DISC = 2
 _HALO = [withStroke(linewidth=1.6, foreground="white")]
 
@@ -232,14 +232,14 @@ def messages(flight: FlightRecord, told: Messages) -> Figure:
         upper, lower = figure.add_subfigure(rows[0]), figure.add_subfigure(rows[1])
         panels = upper.subplots(1, 2)
         age_ms, loss = 1e3 * told.age_s, 100.0 * told.loss
-        _draw_matrix(upper, panels[0], age_ms, names, "median age (ms)", _MUCH_MS)
-        _draw_matrix(upper, panels[1], loss, names, "lost (%)", _MUCH_LOSS)
+        draw_matrix(upper, panels[0], age_ms, names, "median age (ms)", _MUCH_MS)
+        draw_matrix(upper, panels[1], loss, names, "lost (%)", _MUCH_LOSS)
         left, right = lower.subplots(1, 2)
         edges_s = np.linspace(0.0, flight.duration_s, max(2, min(61, int(flight.duration_s) + 1)))
         middles_s = (edges_s[1:] + edges_s[:-1]) / 2.0
         bins = np.digitize(told.heard_at_s, edges_s) - 1
         for share, dashes, name in ((0.5, "-", "median"), (0.95, "--", "95th percentile")):
-            values = [_quantile(told.heard_age_s[bins == b], share) for b in range(len(middles_s))]
+            values = [quantile(told.heard_age_s[bins == b], share) for b in range(len(middles_s))]
             left.plot(middles_s, 1e3 * np.array(values), color=style.BLUE, ls=dashes, label=name)
         left.set(ylabel="message age (ms)")
         left.legend(loc="upper right", ncols=2)
@@ -580,19 +580,19 @@ def _frame(panels: Any, flight: FlightRecord, *, margin: bool) -> None:
     panels[0, 0].set(xlim=(x_low, x_high), ylim=(y_low, y_high))
 
 
-def _draw_matrix(
-    figure: Any, axes: Axes, values: F64, names: list[str], label: str, much: float
+def draw_matrix(
+    figure: Any, axes: Axes, values: F64, names: Sequence[str], label: str, much: float
 ) -> None:
-    """`much` has the strongest colour, unless there is more."""
+    """Values by receiver and sender; `much` has the strongest colour, unless there is more."""
     highest = max(values[np.isfinite(values)].max(initial=0.0), much)
     image = axes.imshow(values, cmap=style.SCALE, vmin=0.0, vmax=highest)
-    step = 1 if len(names) <= _MOST_NAMES else -(-len(names) // _MOST_TICKS)
+    few, step = len(names) <= _MOST_NAMES, -(-len(names) // _MOST_SMALL_NAMES)
     ticks = np.arange(0, len(names), step)
-    axes.set_xticks(ticks, names[::step])
+    axes.set_xticks(ticks, names[::step], rotation=0 if few else 90)
     axes.set_yticks(ticks, names[::step])
-    axes.tick_params(length=0)
+    axes.tick_params(length=0, labelsize=8 if few else 5)
     axes.set(xlabel="sender", ylabel="receiver", facecolor=style.NOTHING)
-    if len(names) <= _MOST_NAMES:
+    if few:
         for row, column in np.argwhere(np.isfinite(values)):
             value = values[row, column]
             colour = "white" if value > 0.6 * highest else INK
@@ -601,8 +601,3 @@ def _draw_matrix(
                 va="center", fontsize=6.5, color=colour,
             )  # fmt: skip
     figure.colorbar(image, ax=axes, label=label, shrink=0.9)
-
-
-def _quantile(values: F64, share: float) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.quantile(known, share)) if len(known) else float("nan")

@@ -172,8 +172,7 @@ class Messages:
 
     def age_quantile_s(self, share: float) -> float:
         """NaN without any message."""
-        ages = self.heard_age_s[np.isfinite(self.heard_age_s)]
-        return float(np.quantile(ages, share)) if len(ages) else math.nan
+        return quantile(self.heard_age_s, share)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -399,6 +398,12 @@ def _least_distance(times_s: F64, places_m: Mapping[str, F64]) -> Separation | N
         if math.isfinite(closest_m) and (least is None or closest_m < least.distance_m):
             least = Separation(closest_m, (one, other), float(times_s[k]))
     return least
+
+
+def quantile(values: F64, share: float) -> float:
+    """Of those that are known; NaN if none is."""
+    known = values[np.isfinite(values)]
+    return float(np.quantile(known, share)) if len(known) else math.nan
 
 
 def _over_first(cost: F64) -> F64:

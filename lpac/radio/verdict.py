@@ -26,8 +26,6 @@ MOST_BUSY = 0.6
 _MODEL_ERR = 1.5
 # As `lpac fleet doctor` has it.
 _WEAK_DBM = -75.0
-# Where no radio tells its own; as docs/scaling.md has it.
-ASSUMED_RATE_MBIT_S = 220.0
 WHAT_RUNS = "`lpac fleet status` tells which programs run; of simulated robots, `lpac sim` does"
 
 
@@ -213,7 +211,7 @@ def _room(checked: Checked) -> Room | None:
         return None
     rates = [w.rate_mbit_s for w in checked.wifi.values() if w.rate_mbit_s]
     # The slowest take the most time.
-    rate_mbit_s = statistics.harmonic_mean(rates) if rates else ASSUMED_RATE_MBIT_S
+    rate_mbit_s = statistics.harmonic_mean(rates) if rates else Wifi().data_rate_mbit_s
     wifi = Wifi(data_rate_mbit_s=rate_mbit_s, ground_wired=checked.ground_wired)
     ground = airtime(checked.transport, wifi, traffic)
     flight_bytes = max(traffic.message_bytes, checked.flight_bytes)

@@ -53,7 +53,7 @@ ALLOWED = {
     "lpac.sim.ports": set(),
     "lpac.sim.programs": set(),
     "lpac.radio": {"edge.core", "edge.messages", "edge.identity"},
-    "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
+    "lpac.radio.heat_map": {"lpac.analysis", "lpac.radio"},
     "lpac.extras": set(),
     "lpac.middleware": {
         "edge.core", "edge.messages", "edge.drivers", "lpac.analysis", "lpac.extras",
@@ -94,7 +94,6 @@ ONLY_IN = {
         "lpac/train/",
         "lpac/ablate/",
         "lpac/paper/",
-        "lpac/radio/heat_map.py",
         "lpac/middleware/figures.py",
     },
     "mavsdk": {"edge/drivers/"},

@@ -12,7 +12,7 @@ from lpac.radio.airtime import Traffic, Transport, Wifi, airtime, carries
 from lpac.radio.checked import Checked, WifiReading
 from lpac.radio.pairs import Pair, Window
 from lpac.radio.records import RadioRecord
-from lpac.radio.verdict import ASSUMED_RATE_MBIT_S, WHAT_RUNS, RadioVerdict, obstacles, verdict
+from lpac.radio.verdict import WHAT_RUNS, RadioVerdict, obstacles, verdict
 from tests.unit.ground import snapshots
 
 N, SENT, BYTES = 10, 50, 1795
@@ -48,7 +48,7 @@ def wifi(**changes: float | None) -> dict[str, WifiReading]:
 
 def test_a_fleet_that_hears_itself_well() -> None:
     traffic = Traffic(robots=N, message_bytes=BYTES + 85, message_hz=2.5)
-    most = carries("mesh", Wifi(data_rate_mbit_s=ASSUMED_RATE_MBIT_S), traffic)
+    most = carries("mesh", Wifi(), traffic)
     told = verdict(checked(), heard())
     assert told.problems == ()
     assert told.sentence == f"carries 10 robots; by the model there is room for {most - N} more"
