@@ -23,6 +23,7 @@ from lpac.ground.script import STEPS, STEPS_BEFORE, ScriptTable
 from lpac.ground.site import SavedSite
 from lpac.radio.airtime import Wifi
 from lpac.sim.scenario import Scenario
+from lpac.study.drills import Drill
 from lpac.study.file import ConditionKeys, StudyFile
 from lpac.train.config import TrainingConfig
 from lpac.train.lpac import LpacNetwork
@@ -128,6 +129,10 @@ def study() -> str:
         *_tables(Scenario, "", "Of its flights"),
         "`controller`, `seed`, `features` and `scale` follow from the study: a file does not have "
         "them.",
+        "## Keys of a drill",
+        "A file with `faults` flies these instead of worlds: [the drill](../drill.md).",
+        _example("examples/drill.toml"),
+        *_tables(Drill, ""),
     )
 
 

@@ -22,7 +22,7 @@ _COMMANDS = {
         "Policies and baselines over many worlds: how well they cover, with confidence intervals."
     ),
     "study": (
-        "Fly an experiment of yours, from a TOML file: policies over worlds, under conditions."
+        "Fly an experiment of yours, from a TOML file: policies over worlds, or faults in flight."
     ),
     "train": (
         "Train a policy, or continue where a training stopped, keeping the weights that fly best."

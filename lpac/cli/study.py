@@ -44,9 +44,15 @@ def study(
         ),
     ] = None,
 ) -> None:
-    """Fly an experiment of yours, from a TOML file: policies over worlds, under conditions."""
-    from lpac.study.file import read_study
+    """Fly an experiment of yours, from a TOML file: policies over worlds, or faults in flight."""
+    from lpac.study.file import read_study, read_toml
 
+    if "faults" in read_toml(file):
+        from lpac.cli.drill import fly_faults
+        from lpac.study.drills import read_drill
+
+        fly_faults(read_drill(file), out or _OUT / file.stem, px4, ray, as_json=as_json)
+        return
     fly_study(read_study(file, px4), file.stem, out or _OUT / file.stem, ray, as_json=as_json)
 
 
@@ -68,7 +74,7 @@ def fly_study(
     # A worker process that draws nothing does not load what draws, and a mistake is told by now.
     cores = pool(ray)
     folder.mkdir(parents=True, exist_ok=True)
-    with folder_lock("the study", folder), _telling("flights") as tell:
+    with folder_lock("the study", folder), telling("flights") as tell:
         flown = run_with_records(study, cores, folder, tell)
     from lpac.study.summary import draw_worst, report_of, sections_of
 
@@ -80,7 +86,7 @@ def fly_study(
     )
     told = report.write(folder)
     if "worst" in study.figures:
-        with _telling("pictures of the worst worlds") as tell:
+        with telling("pictures of the worst worlds") as tell:
             draw_worst(study, flown.results, folder, cores, tell)
     if as_json:
         typer.echo(json.dumps(told, indent=2))
@@ -102,16 +108,18 @@ def show_report(report: "Report", folder: Path) -> None:
         typer.echo(f"\n{table.note}\n" if table.note else "")
     if report.legend:
         typer.echo(f"{report.legend}\n")
-    typer.echo(f"see {folder}: README.md, {report.name}.json, and figures")
+    figures = ", and figures" if report.figures else ""
+    typer.echo(f"see {folder}: README.md, {report.name}.json{figures}")
 
 
 @contextmanager
-def _telling(what: str) -> "Iterator[Callable[[int, int], None]]":
+def telling(what: str) -> "Iterator[Callable[..., None]]":
+    """How far it is, as `tell(done, of)` or `tell(done, of, said)` says."""
     with progress_of(what) as progress:
         task = progress.add_task("", total=None)
 
-        def tell(done: int, of: int) -> None:
-            progress.update(task, completed=done, total=of)
+        def tell(done: int, of: int, said: str = "") -> None:
+            progress.update(task, completed=done, total=of, description=said)
 
         yield tell
 

@@ -62,6 +62,14 @@ class ConditionKeys:
 _DRAWN = ("controller", "seed", "features", "scale")
 
 
+def read_toml(path: Path) -> dict[str, Any]:
+    """What a file holds. Raises ConfigError that names it."""
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
 def read_study(
     path: Path, px4_build: Path | None = None, bundle: Path | str = SHIPPED_BUNDLE
 ) -> Study:
@@ -69,11 +77,7 @@ def read_study(
 
     Raises ConfigError that names file, key, value and what is allowed.
     """
-    try:
-        document = tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: {error}") from None
-    file, where = from_mapping(StudyFile, document, str(path)), str(path)
+    file, where = from_mapping(StudyFile, read_toml(path), str(path)), str(path)
     bundles = file.policies or ({} if file.baselines else {"field": ()})
     try:
         methods = [

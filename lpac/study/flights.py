@@ -4,21 +4,24 @@ import hashlib
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Generic, NamedTuple
 
+import msgspec
 import numpy as np
 
 import edge
+import lpac
 from edge.policy.bundle import Bundle, BundleError
-from lpac import analysis, radio, sim, study
 from lpac.analysis.flight import FlightRecord
 from lpac.sim.cores import Outcome, Pool, in_this_process
 from lpac.sim.engines import IN_REAL_TIME, EngineName, engine_of, loaded_bundle
 from lpac.sim.experiment import cost_times_s
 from lpac.sim.kept import KeptOutcomes, code_digest
 from lpac.sim.scenario import Scenario
+from lpac.sim.sitl.build import build_digest
 
 POLICY = "lpac"
 CLAIRVOYANT = "clairvoyant-cvt"
@@ -32,7 +35,8 @@ class PlannedFlight:
     """A scenario, the engine that flies it, and the bundle.
 
     `bundle` is the path of the one that flies, or that gives a baseline the sizes of sensor and
-    local map; `flown_by` is its id, or says these sizes. PX4s are those of `px4_build`.
+    local map; `flown_by` is its id, or says these sizes. PX4s are those of `px4_build`. `fault` is
+    what the drill does to the fleet.
     """
 
     scenario: Scenario
@@ -40,11 +44,13 @@ class PlannedFlight:
     flown_by: str
     engine: EngineName = "point"
     px4_build: str = ""
+    fault: str = ""
 
     @property
     def key(self) -> str:
         """What tells it from all other flights, wherever the bundle and PX4 lie."""
-        told = repr((self.engine, self.flown_by, self.scenario))
+        px4 = _px4_digest(self.px4_build) if self.engine == "px4" and self.px4_build else ""
+        told = repr((self.engine, self.flown_by, px4, self.fault, self.scenario))
         return hashlib.sha256(told.encode()).hexdigest()
 
 
@@ -64,7 +70,7 @@ class CostCurve(NamedTuple):
 # Flights that go together: those of one batch of the simulator, or one other.
 FlightGroup = tuple[PlannedFlight, ...]
 # Flies a group, in whatever process it is, and says what came of each flight.
-CurvesOf = Callable[[FlightGroup], list[tuple[PlannedFlight, CostCurve]]]
+FlyGroup = Callable[[FlightGroup], list[tuple[PlannedFlight, Outcome]]]
 
 
 def task_of(bundle: Bundle) -> str:
@@ -134,49 +140,63 @@ def curve_of(flight: PlannedFlight, record: FlightRecord) -> CostCurve:
 
 
 def fly_all(
-    do: Callable[[FlightGroup], list[tuple[PlannedFlight, Outcome]]],
+    do: FlyGroup[Outcome],
     flights: Sequence[PlannedFlight],
     pool: Pool,
+    in_real_time: Pool = in_this_process,
 ) -> Generator[tuple[PlannedFlight, Outcome], None, None]:
     """Each flight as it is done, with what `do` makes of its group.
 
-    Flights in real time are in this process, one after another, with nothing beside them.
+    Flights in real time have a pool of their own, and nothing of the other beside them.
     """
     groups: dict[bool, list[FlightGroup]] = {False: [], True: []}
     for group in groups_of(flights):
         groups[group[0].engine in IN_REAL_TIME].append(group)
-    for in_real_time, its in groups.items():
+    for its_pool, its in ((pool, groups[False]), (in_real_time, groups[True])):
         if its:
-            with closing((in_this_process if in_real_time else pool)(do, its)) as flown:
+            with closing(its_pool(do, its)) as flown:
                 yield from chain.from_iterable(flown)
 
 
-class KeptFlights:
+class KeptFlights(Generic[Outcome]):
     """What came of flights, in a folder: who asks again for one that was flown there has it."""
 
-    def __init__(self, folder: Path, curves: CurvesOf = curves_of) -> None:
-        """`curves` flies them; a folder has those of one alone. Raises OSError."""
-        self._curves_of = curves
-        flown_by = {"code": code_digest(edge, analysis, radio, sim, study)}
-        self._kept = KeptOutcomes(folder / _FLIGHTS, flown_by)
-        self._curves = {
-            line["flight"]: CostCurve(tuple(line["time_s"]), tuple(line["cost"]), line["lloyd"])
-            for line in self._kept.lines
+    def __init__(
+        self,
+        folder: Path,
+        do: FlyGroup[Outcome],
+        kind: type[Outcome],
+        is_kept: Callable[[Outcome], bool] = lambda _: True,
+    ) -> None:
+        """`do` flies them, and gives named tuples of this kind: a folder has those of one alone.
+
+        What `is_kept` does not want is flown again. Raises OSError.
+        """
+        self._do, self._is_kept = do, is_kept
+        self._kept = KeptOutcomes(folder / _FLIGHTS, {"code": code_digest(edge, lpac)})
+        self._outcomes = {
+            line["flight"]: msgspec.convert(line["outcome"], kind) for line in self._kept.lines
         }
 
     def fly(
-        self, flights: Sequence[PlannedFlight], pool: Pool
-    ) -> Generator[tuple[PlannedFlight, CostCurve], None, None]:
+        self, flights: Sequence[PlannedFlight], pool: Pool, in_real_time: Pool = in_this_process
+    ) -> Generator[tuple[PlannedFlight, Outcome], None, None]:
         """All of them: first what was flown before, and then the others as they come."""
         missing = []
         for flight in flights:
-            if flight.key in self._curves:
-                yield flight, self._curves[flight.key]
+            if flight.key in self._outcomes:
+                yield flight, self._outcomes[flight.key]
             else:
                 missing.append(flight)
-        with closing(fly_all(self._curves_of, missing, pool)) as flown:
-            for flight, curve in flown:
-                self._curves[flight.key] = curve
-                line = {"flight": flight.key, "seed": flight.scenario.seed, **curve._asdict()}
-                self._kept.add(line)
-                yield flight, curve
+        with closing(fly_all(self._do, missing, pool, in_real_time)) as flown:
+            for flight, outcome in flown:
+                if self._is_kept(outcome):
+                    self._outcomes[flight.key] = outcome
+                    told = {"flight": flight.key, "fault": flight.fault}
+                    self._kept.add({**told, "seed": flight.scenario.seed, "outcome": outcome})
+                yield flight, outcome
+
+
+@cache
+def _px4_digest(build: str) -> str:
+    return build_digest(Path(build))

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from lpac.analysis.flight import FlightRecord
 from lpac.sim.cores import Outcome, Pool, in_this_process
 from lpac.study.flights import (
+    CostCurve,
     KeptFlights,
     PlannedFlight,
     curve_of,
@@ -45,7 +46,8 @@ def run(
 
     Raises BundleError, ValueError, and OSError if the folder cannot be written.
     """
-    flights, keeper = study.flights(), KeptFlights(folder) if folder else None
+    flights = study.flights()
+    keeper = KeptFlights(folder, curves_of, CostCurve) if folder else None
     flown = keeper.fly(flights, pool) if keeper else fly_all(curves_of, flights, pool)
     return results_of(study, _all(flown, len(flights), tell))
 

@@ -14,7 +14,7 @@ from edge.policy.bundle import Bundle
 from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Pool
 from lpac.sim.kept import KeptOutcomes
-from lpac.study.flights import KeptFlights, PlannedFlight
+from lpac.study.flights import CostCurve, KeptFlights, PlannedFlight
 from lpac.study.study import Condition, Method, Study, TrainedBundle
 from lpac.study.worlds import SET_UPS
 from lpac.train.config import SelectConfig
@@ -102,7 +102,7 @@ class Selection:
         """`config` is the digest of the run's. Raises OSError."""
         self._select = select
         self._task = task
-        self._flights = KeptFlights(folder, task.costs)
+        self._flights = KeptFlights(folder, task.costs, CostCurve)
         self._kept = KeptOutcomes(folder / "candidates.jsonl", {"config": config})
 
     @property

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -173,20 +173,11 @@ class FaultyFleet(ABC):
         return tuple(numbers[name] for name in names or numbers)
 
 
-@dataclass(frozen=True, slots=True)
-class DrilledRobots:
-    """Who flies in a drill: how many, with the bundle at what path, and what type of sensor."""
-
-    robots: int
-    bundle: str
-    sensor: str = WORLD_SENSOR
-
-
-def scenario_of(fault: Fault, seed: int, drilled: DrilledRobots) -> Scenario:
+def scenario_of(fault: Fault, seed: int, robots: int, sensor: str = WORLD_SENSOR) -> Scenario:
     """The fleet that flies it: members with keys, on vehicles that err, unless they are exact."""
     return Scenario(
-        robots=drilled.robots, seed=seed, secure=True, errors=not fault.exact,
-        budget=EXACT if fault.exact else ERRORS, sensor=drilled.sensor,
+        robots=robots, seed=seed, secure=True, errors=not fault.exact,
+        budget=EXACT if fault.exact else ERRORS, sensor=sensor,
     )  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from lpac.ground.station.protocol import (
 from lpac.sim.drill.faults import Fault, Phase
 from lpac.sim.drill.injections import Do, Injection
 from lpac.sim.fleet.layout import ORIGIN
+from lpac.sim.scenario import Scenario
 
 # When a fault begins, after its phase has.
 _BEGINS_S: Mapping[Phase, tuple[float, float]] = {
@@ -101,9 +102,9 @@ def to_mission(field: Field) -> Procedure[None]:
         yield from _command(field, request)
 
 
-def fly(field: Field, fault: Fault, seed: int, robots: int) -> Procedure[Timeline]:
+def fly(field: Field, fault: Fault, scenario: Scenario) -> Procedure[Timeline]:
     """From `to_ready`, or for a fault in the mission or later from `to_mission`, to the end."""
-    hit, delay_s = drawn(fault, seed, robots)
+    hit, delay_s = drawn(fault, scenario.seed, scenario.robots)
     delay_s = max([delay_s, *(field.lead_s(do.injection) - do.at_s for do in fault.does)])
     began_s = field.now_s()
     fault_s = began_s + delay_s

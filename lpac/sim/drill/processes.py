@@ -56,6 +56,7 @@ from lpac.sim.fleet.processes import Fleet
 from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError
 from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import Px4Build
 from lpac.sim.sitl.ground_station import RealVehicle, RealVehicles
 
@@ -209,14 +210,14 @@ class ProcessField(FaultyFleet):
         """As it was in `fly`."""
         return self._late_s
 
-    def fly(self, fault: Fault, seed: int) -> Timeline:
+    def fly(self, fault: Fault, scenario: Scenario) -> Timeline:
         """From the programs' start to the end. Raises what `carry_out` does."""
         self.carry_out(to_ready(self))
         self.fleet.begin()
         began_s = time.monotonic()
         if fault.phase in ("mission", "return"):
             self.carry_out(to_mission(self))
-        timeline = self.carry_out(fly(self, fault, seed, len(self.fleet.robots)))
+        timeline = self.carry_out(fly(self, fault, scenario))
         self._late_s = self._late_since_s(began_s)
         return timeline
 

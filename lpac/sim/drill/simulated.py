@@ -15,13 +15,7 @@ from lpac.ground.procedure import NothingComesError, Procedure
 from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
 from lpac.sim.air import GROUND
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.field import (
-    DrilledRobots,
-    FaultyFleet,
-    has_remote_control,
-    scenario_of,
-    settings_of,
-)
+from lpac.sim.drill.field import FaultyFleet, has_remote_control, settings_of
 from lpac.sim.drill.flight import fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
     ClockSteps,
@@ -53,7 +47,7 @@ from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
-from lpac.sim.scenario import WORLD_SENSOR
+from lpac.sim.scenario import WORLD_SENSOR, Scenario
 
 # How far a second program's vehicle stands from the first.
 _BESIDE_M = 3.0
@@ -240,48 +234,48 @@ class _Bases(NamedTuple):
 
 
 class SimulatedDrill:
-    """Flies faults on the simulated clock, one by one; flights of one seed share their begin.
+    """Flies faults on the simulated clock, one by one; those of one scenario share their begin.
 
-    A flight follows from fault, seed and robots, whatever was flown before. Sensors of other types
-    than the built-in one may have a device, or a state: their flights share nothing.
+    A flight follows from fault, scenario and bundle, whatever was flown before. Sensors of other
+    types than the built-in one may have a device, or a state: their flights share nothing.
     """
 
-    def __init__(self, drilled: DrilledRobots) -> None:
-        self._drilled = drilled
+    def __init__(self, bundle: Path) -> None:
+        self._bundle = bundle
         self._key: object = None
         self._bases: _Bases | None = None
 
-    def fly(self, fault: Fault, seed: int, logs: Path | None = None) -> FlightTruth:
+    def fly(self, fault: Fault, scenario: Scenario, logs: Path | None = None) -> FlightTruth:
         """One flight. With `logs` the robots write theirs in that folder."""
         on_ground = fault.phase in ("ready", "takeoff")
-        if logs is None and self._drilled.sensor == WORLD_SENSOR:
-            bases = self._of(fault, seed)
+        if logs is None and scenario.sensor == WORLD_SENSOR:
+            bases = self._of(fault, scenario)
             field = (bases.ready if on_ground else bases.mission).copy()
         else:
             with tempfile.TemporaryDirectory() as nowhere:
                 folder = Path(nowhere) if logs is None else logs
-                field = self._ready(fault, seed, folder, logged=logs is not None)
+                field = self._ready(fault, scenario, folder, logged=logs is not None)
             if not on_ground:
                 field.carry_out(to_mission(field))
-        timeline = field.carry_out(fly(field, fault, seed, self._drilled.robots))
+        timeline = field.carry_out(fly(field, fault, scenario))
         field.fleet.close()
         return field.truth(timeline)
 
-    def _of(self, fault: Fault, seed: int) -> _Bases:
-        key = (seed, fault.exact, fault.settings)
+    def _of(self, fault: Fault, scenario: Scenario) -> _Bases:
+        key = (scenario, fault.settings)
         if self._bases is None or key != self._key:
             with tempfile.TemporaryDirectory() as folder:
-                ready = self._ready(fault, seed, Path(folder))
+                ready = self._ready(fault, scenario, Path(folder))
             mission = ready.copy()
             mission.carry_out(to_mission(mission))
             self._key, self._bases = key, _Bases(ready, mission)
         return self._bases
 
     def _ready(
-        self, fault: Fault, seed: int, folder: Path, *, logged: bool = False
+        self, fault: Fault, scenario: Scenario, folder: Path, *, logged: bool = False
     ) -> SimulatedField:
-        scenario, bundle = scenario_of(fault, seed, self._drilled), Path(self._drilled.bundle)
-        fleet = SimulatedFleet(scenario, folder, bundle, settings=settings_of(fault), logs=logged)
+        settings = settings_of(fault)
+        fleet = SimulatedFleet(scenario, folder, self._bundle, settings=settings, logs=logged)
         if has_remote_control(fault):
             for each in fleet.vehicles:
                 each.vehicle.rc_connected = True

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -17,13 +16,11 @@ from ray.cluster_utils import Cluster
 from edge.policy.bundle import load_bundle
 from lpac.analysis.logs import read_logs
 from lpac.analysis.truth import TRUTH, load_truth
-from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.sim.cluster import over_ray
 from lpac.sim.cores import over_cores
-from lpac.sim.drill.campaign import Campaign, FlightOutcome, fly_order
-from lpac.sim.drill.faults import FAULTS
-from lpac.sim.drill.field import DrilledRobots
-from lpac.study.flights import KeptFlights, curves_of
+from lpac.sim.drill.outcome import FlightOutcome
+from lpac.study.drills import Drill, fly_drill
+from lpac.study.flights import CostCurve, KeptFlights, PlannedFlight, curves_of
 from lpac.study.study import Condition, Method, Study
 from lpac.study.worlds import FIELD
 from lpac.train.rollout import ShardTask, fly_shard, plan_round
@@ -32,8 +29,7 @@ from tests.conftest import SHIPPED
 from tests.training import here, read
 
 # They soon come down.
-LANDED, GONE = FAULTS["landed"], FAULTS["ground-dies"]
-DRILLED = DrilledRobots(2, str(DEFAULT_BUNDLE))
+DRILL = Drill(faults=("landed", "ground-dies"), first_seed=1, robots=2)
 
 
 @pytest.fixture(scope="module")
@@ -52,36 +48,33 @@ def cluster() -> Iterator[Cluster]:
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], FlightOutcome]:
+def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[PlannedFlight, FlightOutcome]:
     """Two faults, over all cores."""
-    campaign = Campaign(tmp_path_factory.mktemp("cores"), "simulated", DRILLED)
-    return {
-        (o.fault, o.seed): o
-        for o in campaign.fly([LANDED, GONE], [1], partial(over_cores, fly_order))
-    }
+    return fly_drill(DRILL.flights(), tmp_path_factory.mktemp("cores"), over_cores)
 
 
 def test_flights_over_cores_hold_what_is_promised(
-    flown: dict[tuple[str, int], FlightOutcome],
+    flown: dict[PlannedFlight, FlightOutcome],
 ) -> None:
-    assert flown.keys() == {("landed", 1), ("ground-dies", 1)}
+    asked = [(flight.fault, flight.scenario.seed) for flight in flown]
+    assert asked == [("ground-dies", 1), ("landed", 1)]
     assert all(outcome.held for outcome in flown.values())
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_a_cluster_of_two_nodes_flies_the_same(
-    tmp_path: Path, cluster: Cluster, flown: dict[tuple[str, int], FlightOutcome]
+    tmp_path: Path, cluster: Cluster, flown: dict[PlannedFlight, FlightOutcome]
 ) -> None:
-    campaign = Campaign(tmp_path, "simulated", DRILLED)
-    again = campaign.fly([LANDED, GONE], [1], partial(over_ray(cluster.address), fly_order))
-    assert {(outcome.fault, outcome.seed): outcome for outcome in again} == flown
+    assert fly_drill(DRILL.flights(), tmp_path, over_ray(cluster.address)) == flown
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_a_study_over_a_cluster_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
     condition = Condition(scenario=FIELD.scenario(duration_s=1.0))
     study = Study(methods=(Method.of("field", SHIPPED),), conditions=(condition,), worlds=1)
-    flown = dict(KeptFlights(tmp_path).fly(study.flights(), over_ray(cluster.address)))
+    flown = dict(
+        KeptFlights(tmp_path, curves_of, CostCurve).fly(study.flights(), over_ray(cluster.address))
+    )
     assert flown == dict(pair for flight in study.flights() for pair in curves_of((flight,)))
 
 
@@ -125,7 +118,8 @@ def test_a_campaign_that_was_killed_goes_on(tmp_path: Path) -> None:
     # What another version of the code has flown does not count.
     first, *others = _lines(kept)
     kept.write_text("\n".join([first.replace('"code": "', '"code": "x'), *others]) + "\n")
-    assert Campaign(out, "simulated", DRILLED).outcomes == {}
+    assert called("drill", *options[:4], "-n", "2", "--out", out).returncode == 0
+    assert len(_lines(kept)) == 1 + 2
 
 
 def _lines(path: Path) -> list[str]:
@@ -133,32 +127,32 @@ def _lines(path: Path) -> list[str]:
 
 
 def test_a_flight_again_is_that_flight_with_logs_and_figure(
-    tmp_path: Path, flown: dict[tuple[str, int], FlightOutcome]
+    tmp_path: Path, flown: dict[PlannedFlight, FlightOutcome]
 ) -> None:
     result = called("drill", "--fault", "landed", "--seed", 1, "-n", 2, "--out", tmp_path, "--json")
     assert result.returncode == 0, (result.stdout, result.stderr)
     [told] = json.loads(result.stdout)["faults"]
-    first = flown["landed", 1]
+    first = next(outcome for flight, outcome in flown.items() if flight.fault == "landed")
     worst = {figure["name"]: figure["value"] for figure in told["worst"]}
     assert worst == {figure.name: figure.value for figure in first.figures}
     folder = tmp_path / "landed-1"
     assert (folder / "drill.png").exists() and (folder / "drill.xml").exists()
     # On the clock of the robots' logs.
     truth, logs = load_truth(folder / TRUTH), read_logs([folder])
-    assert len(truth) == DRILLED.robots
+    assert len(truth) == DRILL.robots
     for robot, track in truth.items():
         said_s = [status.time_s for status in logs.statuses[robot]]
         assert track.time_s[0] <= said_s[0] + 1.0 and said_s[-1] <= track.time_s[-1] + 1.0
-    assert len(list(folder.glob("robots/*/logs/*.mcap"))) == DRILLED.robots
+    assert len(list(folder.glob("robots/*/logs/*.mcap"))) == DRILL.robots
 
 
 def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
     for arguments, text in (
         (("--fault", "nothing"), "--fault nothing: there is none; `lpac drill --list` has all"),
-        (("--seeds", 0), "--seeds 0: must be at least 1"),
-        (("--seed", -1), "--seed -1: must be at least 0"),
+        (("--seeds", 0), "--seeds = 0: must be at least 1"),
+        (("--seed", -1), "--seed = -1: must be at least 0"),
         (("--seeds", 2, "--seed", 1), "--seeds and --seed: give one of them"),
-        (("-n", 1), "--robots 1: must be from 2 to 10"),
+        (("-n", 1), "--robots = 1: must be from 2 to 10"),
         (("--ray", "127.0.0.1:1"), "127.0.0.1:1"),
     ):
         assert text in error_line(called("drill", *arguments, "--out", tmp_path))

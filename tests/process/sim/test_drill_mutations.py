@@ -21,7 +21,7 @@ from edge.messages.mission import FlightState
 from lpac.ground.station.station import Station
 from lpac.sim.drill.bounds import judge
 from lpac.sim.drill.faults import FAULTS
-from lpac.sim.drill.field import DrilledRobots
+from lpac.sim.drill.field import scenario_of
 from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.fleet.layout import Layout
 from lpac.sim.fleet.robots import SimulatedWatchdog
@@ -155,8 +155,8 @@ def test_a_mutation_breaks_its_promise(
 
 
 @cache
-def _drill(robots: int) -> SimulatedDrill:
-    return SimulatedDrill(DrilledRobots(robots, str(SHIPPED)))
+def _drill(_robots: int) -> SimulatedDrill:
+    return SimulatedDrill(SHIPPED)
 
 
 @cache
@@ -168,6 +168,6 @@ def _broken_without(fault: str, robots: int) -> list[str]:
 def _broken(name: str, robots: int) -> list[str]:
     fault = FAULTS[name]
     with errors_only():
-        truth = _drill(robots).fly(fault, 0)
+        truth = _drill(robots).fly(fault, scenario_of(fault, 0, robots))
     figures = judge(fault.judged_by, truth)
     return [figure.name for figure in figures if figure.broken]

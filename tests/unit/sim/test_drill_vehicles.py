@@ -2,21 +2,19 @@
 
 import math
 import re
-from collections.abc import Generator, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lpac.sim.description import ERRORS, fence_around
-from lpac.sim.drill.campaign import LATE_S, Campaign, FlightOutcome, FlightTask, outcome_of
 from lpac.sim.drill.faults import FAULTS
-from lpac.sim.drill.field import DrilledRobots, supports
+from lpac.sim.drill.field import supports
+from lpac.sim.drill.outcome import LATE_S, outcome_of
 from lpac.sim.drill.processes import MAVLINK, PX4
 from lpac.sim.drill.simulated import SUPPORTED
 from lpac.sim.drill.truth import FlightTruth, VehicleTruth
 from lpac.sim.px4.modes import Px4Mode
-from tests.conftest import ROOT, SHIPPED
+from tests.conftest import ROOT
 
 
 def test_the_table_tells_who_flies_what() -> None:
@@ -64,25 +62,9 @@ def never_down(late_s: float) -> FlightTruth:
 
 def test_what_breaks_while_the_machine_is_late_is_not_judged() -> None:
     fault = FAULTS["held"]
-    judged = outcome_of(fault, 0, lambda: never_down(LATE_S))
+    judged = outcome_of(fault, lambda: never_down(LATE_S))
     assert not judged.error and "not down in the end" in {each.name for each in judged.broken}
-    late = outcome_of(fault, 0, lambda: never_down(LATE_S + 0.1))
+    late = outcome_of(fault, lambda: never_down(LATE_S + 0.1))
     assert late.error.startswith("not judged (not down in the end")
     assert late.error.endswith("this machine was 0.3 s behind real time")
     assert late.late_s == pytest.approx(LATE_S + 0.1)
-
-
-def test_what_was_not_judged_is_flown_again(tmp_path: Path) -> None:
-    flown: list[str] = []
-
-    def fly_all(tasks: Sequence[FlightTask]) -> Generator[FlightOutcome, None, None]:
-        for task in tasks:
-            flown.append(task.fault)
-            error = "not judged" if task.fault == "held" else ""
-            yield FlightOutcome(task.fault, task.seed, (), error)
-
-    faults = [FAULTS["held"], FAULTS["landed"]]
-    for _ in range(2):
-        campaign = Campaign(tmp_path, "mavlink", DrilledRobots(2, str(SHIPPED)))
-        assert len(list(campaign.fly(faults, [0], fly_all))) == 2
-    assert sorted(flown) == ["held", "held", "landed"]

@@ -1,0 +1,191 @@
+"""Drills: studies whose flights have a fault each, judged by the promises of that fault."""
+
+import os
+import signal
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from edge.core.logger import show
+from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, from_mapping
+from edge.drivers.registry import open_sensor
+from edge.policy.bundle import load_bundle
+from lpac.shipped import SHIPPED_BUNDLE
+from lpac.sim.cores import Pool, in_this_process, over_processes
+from lpac.sim.drill.faults import FAULTS, Fault
+from lpac.sim.drill.field import scenario_of, supports
+from lpac.sim.drill.outcome import FlightOutcome, outcome_of
+from lpac.sim.drill.processes import MAVLINK, PX4
+from lpac.sim.drill.simulated import SUPPORTED, SimulatedDrill
+from lpac.sim.scenario import WORLD_SENSOR
+from lpac.sim.sitl.build import require_build
+from lpac.study.file import read_toml
+from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight
+
+DrillEngine = Literal["simulated", "mavlink", "px4"]
+# What is done to a fleet by each.
+INJECTIONS: dict[DrillEngine, tuple[type, ...]] = {
+    "simulated": SUPPORTED, "mavlink": MAVLINK, "px4": PX4,
+}  # fmt: skip
+# A robot with its vehicle and its part of a ground takes 0.12 of a core, averaged over a flight.
+_CORES_EACH = 0.16
+
+# Gets how many flights are done, of how many, and what is to be said of them.
+Tell = Callable[[int, int, str], object]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drill(Bounded):
+    """Each of `faults`, or all that the engine flies, with so many `seeds` from `first_seed` on.
+
+    `sensor` is the `type` in robot.toml's [sensor].
+
+    Raises ValueError that names what is impossible.
+    """
+
+    faults: tuple[str, ...] = ()
+    seeds: AtLeastOne = 1
+    first_seed: AtLeastZero = 0
+    robots: Annotated[int, Meta(ge=2, le=10)] = 4
+    engine: DrillEngine = "simulated"
+    bundle: str = str(SHIPPED_BUNDLE)
+    sensor: str = WORLD_SENSOR
+
+    def check_rules(self) -> None:
+        """See `Bounded`."""
+        faults_of(self.faults, self.engine, "faults:")
+
+    def flights(self, px4_build: Path | None = None) -> list[PlannedFlight]:
+        """All of them; those that share their begin beside each other.
+
+        Raises BundleError, ConfigError for the sensor, ValueError for PX4's build.
+        """
+        bundle, px4 = load_bundle(Path(self.bundle)), ""
+        if self.engine == "px4":
+            if px4_build is None:
+                raise ValueError("engine = 'px4': needs PX4's build folder")
+            px4 = str(require_build(px4_build).resolve())
+        # Flights of a scenario, and of the same settings, share their begin.
+        faults = sorted(
+            faults_of(self.faults, self.engine), key=lambda fault: (fault.exact, fault.settings)
+        )
+        flights = [
+            PlannedFlight(
+                scenario=scenario_of(fault, seed, self.robots, self.sensor),
+                bundle=str(Path(self.bundle).resolve()),
+                flown_by=bundle.id,
+                engine=self.engine,
+                px4_build=px4,
+                fault=fault.name,
+            )
+            for seed in range(self.first_seed, self.first_seed + self.seeds)
+            for fault in faults
+        ]
+        flights[0].scenario.perception_of(bundle)
+        open_sensor(self.sensor, {}, bundle.manifest)
+        return flights
+
+
+def faults_of(names: Sequence[str], engine: DrillEngine, where: str = "") -> list[Fault]:
+    """Those named, or all that the engine flies. Raises ValueError for one that it does not fly."""
+    for name in names:
+        if name not in FAULTS:
+            raise ValueError(f"{where} {name}: there is none; `lpac drill --list` has all")
+    flown = [fault for fault in map(FAULTS.__getitem__, names or FAULTS) if flies(engine, fault)]
+    if names and len(flown) < len(names):
+        others = ", ".join(name for name in names if FAULTS[name] not in flown)
+        raise ValueError(
+            f"{where} {others}: is not flown with {engine}; `lpac drill --list` tells what is"
+        )
+    return flown
+
+
+def flies(engine: DrillEngine, fault: Fault) -> bool:
+    """Whether all that a fault does can be done to the vehicles of an engine."""
+    return supports(INJECTIONS[engine], fault)
+
+
+def read_drill(path: Path) -> Drill:
+    """A drill in a TOML file; the bundle's path counts from its folder.
+
+    Raises ConfigError that names file, key, value and what is allowed.
+    """
+    drill = from_mapping(Drill, read_toml(path), str(path))
+    return replace(drill, bundle=str(path.parent / drill.bundle))
+
+
+def fly_drill(
+    flights: Sequence[PlannedFlight],
+    folder: Path,
+    pool: Pool = in_this_process,
+    tell: Tell = lambda *_: None,
+) -> dict[PlannedFlight, FlightOutcome]:
+    """Fly those of a drill that were not flown and kept in `folder`; by fault, and then by seed.
+
+    On the simulated clock over a `pool`. In real time as many at once as this machine carries;
+    each leaves its logs and a figure in `folder`.
+
+    Raises OSError.
+    """
+    one = flights[0]
+    do = outcomes_of if one.engine == "simulated" else partial(_in_worker, folder=folder)
+    kept = KeptFlights(folder, do, FlightOutcome, lambda outcome: not outcome.error)
+    at_once = 1
+    # PX4's ports are the same for all fleets.
+    if one.engine == "mavlink":
+        at_once = int(len(os.sched_getaffinity(0)) / (_CORES_EACH * one.scenario.robots))
+    beside = partial(over_processes, at_most=max(1, at_once))
+    outcomes: dict[PlannedFlight, FlightOutcome] = {}
+    broken = 0
+    with closing(kept.fly(flights, pool, beside)) as flown:
+        for flight, outcome in flown:
+            outcomes[flight] = outcome
+            broken += not outcome.held
+            tell(len(outcomes), len(flights), f"{broken} broke a promise" if broken else "")
+    places = {name: place for place, name in enumerate(FAULTS)}
+    in_order = sorted(flights, key=lambda flight: (places[flight.fault], flight.scenario.seed))
+    return {flight: outcomes[flight] for flight in in_order}
+
+
+def outcomes_of(
+    group: FlightGroup, folder: Path | None = None
+) -> list[tuple[PlannedFlight, FlightOutcome]]:
+    """Fly a fault, in whatever process this is; logs and a figure stay in `logs_of(it, folder)`."""
+    [flight] = group
+    fault, scenario, bundle = FAULTS[flight.fault], flight.scenario, Path(flight.bundle)
+    # Thousands of flights say more than anybody reads.
+    show("error")
+    if folder is None:
+        outcome = outcome_of(fault, lambda: _drill(bundle).fly(fault, scenario))
+        return [(flight, outcome)]
+    # Whoever keeps nothing draws nothing.
+    from lpac.sim.drill.logged import fly_logged  # noqa: PLC0415
+
+    outcome = fly_logged(
+        fault, scenario, bundle, logs_of(flight, folder),
+        Path(flight.px4_build) if flight.px4_build else None,
+        in_real_time=flight.engine != "simulated",
+    )  # fmt: skip
+    return [(flight, outcome)]
+
+
+def logs_of(flight: PlannedFlight, folder: Path) -> Path:
+    """Where a flight leaves its logs."""
+    return folder / f"{flight.fault}-{flight.scenario.seed}"
+
+
+_drill = cache(SimulatedDrill)
+
+
+def _in_worker(group: FlightGroup, folder: Path) -> list[tuple[PlannedFlight, FlightOutcome]]:
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return outcomes_of(group, folder)
+    except KeyboardInterrupt:
+        # Its programs have ended. A worker of a pool would go on with the next flight.
+        os._exit(1)
