@@ -39,8 +39,8 @@ def ablate(
 ) -> None:
     """Train a method without each of its parts, and say what each of them is worth."""
     from lpac.ablate.config import read_ablation
-    from lpac.ablate.report import write_report
     from lpac.ablate.run import AblationRun
+    from lpac.ablate.summary import write_report
 
     read = read_ablation(ablation)
     cores = pool(ray)
@@ -68,7 +68,7 @@ def _progress() -> "Iterator[Callable[[AblationProgress], None]]":
 
 
 def _show(read: "Ablation", results: "list[VariantResult]", folder: Path) -> None:
-    from lpac.ablate.report import no_claim, numbers_of
+    from lpac.ablate.summary import no_claim, numbers_of
 
     config = read.config
     typer.echo(

@@ -21,7 +21,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 7,
 ) -> None:
     """Ten robots over an unknown world for 60 s, beside the baselines; makes a figure."""
-    from lpac.sim.report import write_demo
+    from lpac.sim.flight_files import write_demo
     from lpac.sim.scenario import Scenario
     from lpac.sim.usual import judgement, usual_points
 

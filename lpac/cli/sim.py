@@ -299,7 +299,7 @@ def _fly_points(scenario: "Scenario", run: RunOptions, drawn: FlightOptions) -> 
     _tell_of_features_outside(drawn.world, scenario.features, run.bundle, scenario.world_size)
     [flight] = fly_points([(scenario.controller, scenario)], run.bundle)
     if run.out:
-        from lpac.sim.report import write_flight
+        from lpac.sim.flight_files import write_flight
 
         write_flight(flight, run.out)
     if run.as_json:
@@ -366,7 +366,7 @@ def _show_fleet_flight(flight: "FleetFlight", run: RunOptions) -> None:
     out = run.out
 
     if out:
-        from lpac.sim.report import write_fleet_flight
+        from lpac.sim.flight_files import write_fleet_flight
 
         write_fleet_flight(flight, out)
     if run.as_json:

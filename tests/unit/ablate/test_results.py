@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from lpac.ablate.config import Ablation, read_ablation
-from lpac.ablate.report import no_claim
 from lpac.ablate.results import VariantResult, results_of, study_of
+from lpac.ablate.summary import no_claim
 from lpac.study.flights import CostCurve
 from lpac.study.results import results_of as results_of_study
 from lpac.study.study import TrainedBundle

@@ -8,8 +8,8 @@ import pytest
 
 from edge.core.schema import ConfigError
 from lpac.ablate.config import Ablation, read_ablation
-from lpac.ablate.report import write_report
 from lpac.ablate.run import AblationProgress, AblationRun
+from lpac.ablate.summary import write_report
 from lpac.sim.cores import Outcome, Task
 from tests.training import here
 from tests.unit.ablate.test_config import written
