@@ -24,7 +24,7 @@ from lpac.ground.site import SavedSite
 from lpac.radio.airtime import Wifi
 from lpac.sim.scenario import Scenario
 from lpac.study.drills import Drill
-from lpac.study.file import ConditionKeys, StudyFile
+from lpac.study.file import DRAWN, ConditionKeys, StudyFile
 from lpac.train.config import TrainingConfig
 from lpac.train.lpac import LpacNetwork
 
@@ -36,7 +36,7 @@ FLEET = (FleetTable, RobotTable)
 GROUND = (ScriptTable, *STEPS_BEFORE.values(), *STEPS.values(), SavedSite, Wifi)
 TRAINING = (TrainingConfig, LpacNetwork, PolicyParameters)
 ABLATION = (AblationConfig,)
-STUDY = (StudyFile, ConditionKeys, Scenario)
+STUDY = (StudyFile, ConditionKeys)
 MANIFEST = (Manifest, LpacManifest)
 
 
@@ -126,9 +126,7 @@ def study() -> str:
         *_tables(StudyFile, ""),
         "## Keys of `[scenario]` and of each of `[[conditions]]`",
         *_tables(ConditionKeys, "", "Of the condition"),
-        *_tables(Scenario, "", "Of its flights"),
-        "`controller`, `seed`, `features` and `scale` follow from the study: a file does not have "
-        "them.",
+        *_tables(Scenario, "", "Of its flights", hidden=DRAWN),
         "## Keys of a drill",
         "A file with `faults` flies these instead of worlds: [the drill](../drill.md).",
         _example("examples/drill.toml"),
@@ -166,13 +164,19 @@ def _example(path: str) -> str:
 
 
 def _tables(
-    cls: type[Any], path: str, title: str | None = None, but: tuple[str, ...] = ()
-) -> Iterator[str]:
-    """A section for the dataclass at `path` of the file, and one for each within it."""
+    cls: type[Any], path: str, title: str | None = None, but: tuple[str, ...] = (),
+    hidden: tuple[str, ...] = (),
+) -> Iterator[str]:  # fmt: skip
+    """A section for the dataclass at `path` of the file, and one for each within it.
+
+    Those within `but` have none; a file does not have the `hidden` keys.
+    """
     yield f"### {title or (f'[{path}]' if path else 'The top of the file')}"
     yield _about(cls)
     rows, below = [], []
     for field in dataclasses.fields(cls):
+        if field.name in hidden:
+            continue
         hint = _hints(cls)[field.name]
         within = _within(hint)
         if within is not None and field.name not in but:

@@ -5,9 +5,11 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
 
-from edge.core.schema import ConfigError, from_mapping
+from msgspec import Meta
+
+from edge.core.schema import AtLeastOne, ConfigError, NonNegative, from_mapping
 from edge.core.world import parse_world
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.baselines import BaselineName
@@ -22,44 +24,68 @@ from lpac.study.worlds import SET_UPS, WorldSet
 class StudyFile:
     """A study as its file has it; paths count from the file's folder.
 
-    `policies` are lists of bundles by name, one bundle for each training; the shipped policy flies
-    if there are none. `scenario` has keys of `Scenario` and of `Condition`, and `set_up`, a name
-    from `SET_UPS`, or `world`, the path of a world file. Each of `conditions` says what is
-    otherwise: a list of values where there should be one means a condition for each of them, and
-    several such lists one for each combination.
+    The shipped policy flies if no other and no baseline is named. `scenario` and each of
+    `conditions` have keys of `ConditionKeys` and of `Scenario`. In a condition, a list of values
+    where there should be one means a condition for each of them, and several such lists one for
+    each combination.
     """
 
-    title: str = ""
-    text: str = ""
-    policies: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    baselines: tuple[BaselineName, ...] = ()
-    world_set: WorldSet = "validation"
-    first_world: int = 0
-    worlds: int = 20
-    scenario: dict[str, object] = field(default_factory=dict)
-    conditions: tuple[dict[str, object], ...] = ({},)
-    starts: Literal["own", "first"] = "own"
-    trials: int = 1
-    placed_within_m: float = 0.0
-    receiver_error_m: tuple[float, float] | None = None
-    figures: tuple[Figure, ...] = USUAL_FIGURES
+    title: Annotated[str, "Of the report; else the file's name."] = ""
+    text: Annotated[str, "What a reader of the report should know."] = ""
+    policies: Annotated[
+        dict[str, tuple[str, ...]],
+        "By name the paths of its bundles, one per training; [] is the shipped one.",
+    ] = field(default_factory=dict)
+    baselines: Annotated[
+        tuple[BaselineName, ...], "Beside clairvoyant-cvt, which always flies."
+    ] = ()
+    world_set: Annotated[WorldSet, "Look at test only once."] = "validation"
+    first_world: Annotated[int, Meta(ge=0), "Number of the first world of the set."] = 0
+    worlds: Annotated[AtLeastOne, "How many, from the first on."] = 20
+    starts: Annotated[
+        Literal["own", "first"],
+        "Where robots start: in each world where its number says, or where the first one's do.",
+    ] = "own"
+    trials: Annotated[AtLeastOne, "How often each world is flown."] = 1
+    placed_within_m: Annotated[
+        NonNegative, "How far from the same starts robots are placed in each trial, m."
+    ] = 0.0
+    receiver_error_m: Annotated[
+        tuple[NonNegative, NonNegative] | None,
+        "[least, greatest]: how wrong the positions of points are throughout a trial, m.",
+    ] = None
+    scenario: Annotated[dict[str, object], "What all flights have alike: see below."] = field(
+        default_factory=dict
+    )
+    conditions: Annotated[
+        tuple[dict[str, object], ...], Meta(min_length=1), "What is otherwise: see below."
+    ] = ({},)
+    figures: Annotated[tuple[Figure, ...], "Which are drawn."] = USUAL_FIGURES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConditionKeys:
     """Keys of a condition that are none of its scenario's."""
 
-    title: str = ""
-    engine: EngineName = "point"
-    from_pads: bool = False
-    lost: str = ""
-    methods: tuple[str, ...] = ()
-    set_up: str = "field"
-    world: str = ""
+    title: Annotated[str, "Its name in figures and tables; else what is otherwise."] = ""
+    engine: Annotated[
+        EngineName,
+        "What flies the policies: points; whole robots on one simulated clock; a program for each "
+        "robot in real time, on simulated vehicles or on real PX4s (--px4).",
+    ] = "point"
+    from_pads: Annotated[
+        bool, "Points begin on the pads of whole robots, as wrong about their places as these."
+    ] = False
+    lost: Annotated[str, "Points lost in flight, ROBOTS@SECONDS, such as 2@20."] = ""
+    methods: Annotated[tuple[str, ...], "Names of those that fly it; else all."] = ()
+    set_up: Annotated[
+        str, "Team and world, from which other keys differ: field, n32, paper, ..."
+    ] = "field"
+    world: Annotated[str, "Path of a world file; else worlds are drawn."] = ""
 
 
 # Keys of a scenario that the study says.
-_DRAWN = ("controller", "seed", "features", "scale")
+DRAWN = ("controller", "seed", "features", "scale")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -126,7 +152,7 @@ def condition_of(keys: Mapping[str, object], where: str, folder: Path = Path()) 
     own = from_mapping(ConditionKeys, {k: v for k, v in keys.items() if k in own_names}, where)
     if own.set_up not in SET_UPS:
         raise ConfigError(f"{where}: set_up = {own.set_up!r}: allowed are {', '.join(SET_UPS)}")
-    known = (*own_names, *(each.name for each in fields(Scenario) if each.name not in _DRAWN))
+    known = (*own_names, *(each.name for each in fields(Scenario) if each.name not in DRAWN))
     for key in keys:
         if key not in known:
             raise ConfigError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")

@@ -120,6 +120,7 @@ def test_every_command_and_option_is_in_the_reference() -> None:
         (configuration.fleet, configuration.FLEET),
         (configuration.ground, configuration.GROUND),
         (configuration.training, configuration.TRAINING),
+        (configuration.study, configuration.STUDY),
         (configuration.ablation, configuration.ABLATION),
         (configuration.manifest, configuration.MANIFEST),
     ],
@@ -144,7 +145,7 @@ def test_keys_have_their_defaults_and_kinds() -> None:
 def test_bounds_of_a_file_hold_in_python_too_and_leave_no_number_infinite() -> None:
     files = (
         configuration.ROBOT, configuration.FLEET, configuration.GROUND, configuration.TRAINING,
-        configuration.MANIFEST,
+        configuration.STUDY, configuration.MANIFEST,
     )  # fmt: skip
     for cls in (kind for each in chain(*files) for kind in read_kinds(each)):
         bounds = bounds_of(cls)
