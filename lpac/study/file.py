@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type
 
 from msgspec import Meta
 
-from edge.core.schema import AtLeastOne, ConfigError, NonNegative, from_mapping
+from edge.core.schema import AtLeastOne, Bounded, ConfigError, NonNegative, from_mapping
 from edge.core.world import parse_world
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.baselines import BaselineName
@@ -21,7 +21,7 @@ from lpac.study.worlds import SET_UPS, WorldSet
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StudyFile:
+class StudyFile(Bounded):
     """A study as its file has it; paths count from the file's folder.
 
     The shipped policy flies if no other and no baseline is named. `scenario` and each of
