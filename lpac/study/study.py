@@ -19,7 +19,7 @@ from edge.policy.bundle import load_bundle
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.baselines import BaselineName
 from lpac.sim.description import FIELD_SCALE
-from lpac.sim.engines import Engine, EngineName, engine_of
+from lpac.sim.engines import Engine, EngineName, engine_of, loaded_bundle
 from lpac.sim.failure import NONE_LOST, Failure, LostRobots
 from lpac.sim.fleet.layout import Layout, pads_for_all
 from lpac.sim.scenario import Scenario
@@ -219,7 +219,7 @@ class Study(Bounded):
             for name in condition.methods:
                 if name not in names:
                     raise ValueError(f"methods = {name!r}: must be one of {', '.join(names)}")
-        tasks = {task_of(load_bundle(path)): path for path in self._bundles}
+        tasks = {task_of(loaded_bundle(path)): path for path in self._bundles}
         if len(tasks) > 1:
             different = "; ".join(f"{path}: {task}" for task, path in tasks.items())
             raise ValueError(f"bundles of different tasks: {different}")
@@ -244,7 +244,7 @@ class Study(Bounded):
     @property
     def sizes(self) -> str:
         """What baselines take from a bundle, in words."""
-        return sizes_of(load_bundle(self.sized_by))
+        return sizes_of(loaded_bundle(self.sized_by))
 
     @property
     def draws(self) -> list[Draw]:
