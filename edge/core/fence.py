@@ -55,7 +55,7 @@ class Fence(Bounded):
 
         NaN where x or y is.
         """
-        return float(self.edges().distances_m(np.array([x_m, y_m])).min())
+        return float(np.minimum.reduce(self.edges().distances_m(np.array([x_m, y_m]))))
 
     def moved_inside_m(self, x_m: float, y_m: float, depth_m: float) -> tuple[float, float]:
         """The place itself if it is `depth_m` inside every line, else the nearest that is, m.

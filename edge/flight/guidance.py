@@ -97,9 +97,10 @@ def guide(
     nowhere = Guidance(parted=guidance.parted)
     if state is FlightState.ARMING or inputs.odometry is None or height is None:
         return _STOP, nowhere
-    position_m = np.array([*inputs.odometry.position_m[:2], height])
-    if not np.isfinite(position_m).all():
+    x_m, y_m, _ = inputs.odometry.position_m
+    if not all(map(math.isfinite, (x_m, y_m, height))):
         return _STOP, nowhere
+    position_m = np.array([x_m, y_m, height])
     if inputs.position.quality is not PositionQuality.GOOD:
         return _stay(robot, flight, height), Guidance()
     if state is FlightState.HOLD:

@@ -184,7 +184,7 @@ def keep_inside(
         return np.zeros(3), recovering
     edges = fence.edges()
     distances_m = edges.distances_m(position_m[:2])
-    depth_m = float(distances_m.min())
+    depth_m = float(np.minimum.reduce(distances_m))
     recovering = depth_m < 0.0 or (recovering and depth_m < fence.buffer_m / 2.0)
     if recovering:
         # Downhill on the sum of the squared shortfalls, which is convex: it ends inside, in

@@ -278,7 +278,8 @@ class Robot:
     def told(self, ground: GroundState) -> tuple[Fence, Place]:
         """Fence and place that the ground gives it, or else its own."""
         fence = self.fence if ground.fence is None else ground.fence
-        return fence, ground.places.get(str(self.robot_id), self.place)
+        place = ground.places.get(str(self.robot_id))
+        return fence, self.place if place is None else place
 
     def assigned(self, ground: GroundState) -> "Robot":
         """The same with those. Raises ValueError, which the operator reads, if they do not fit."""

@@ -430,12 +430,16 @@ class FlightControl:
             if beacon.frame_id == frame_id and beacon.robot_id != robot.robot_id:
                 self._last_beacons[beacon.robot_id] = beacon
         others, parameters = self._last_beacons, robot.parameters
-        unheard = [
-            standing
+        standing = standing_robots(others.values())
+        standing += [
+            place
             for each in silent
             if each.age_s > _SILENT_FOR_GOOD_S
-            for standing in may_stand(each, others[each.robot_id].landing_point_m, robot.silence)
+            for place in may_stand(each, others[each.robot_id].landing_point_m, robot.silence)
         ]
+        if not standing:
+            self._lands_beside_m = None
+            return None
         # Of two who look for a place, the lower one is first.
         return_first = [
             beacon.position_m[:2]
@@ -448,7 +452,7 @@ class FlightControl:
         self._lands_beside_m = place_to_land(
             (x_m, y_m),
             self._lands_beside_m,
-            [*standing_robots(others.values()), *unheard],
+            standing,
             [*(beacon.landing_point_m for beacon in others.values()), *return_first],
             robot.fence,
             robot.errors,

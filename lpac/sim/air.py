@@ -48,6 +48,8 @@ class Air(Bounded):
         """Whether nothing of the one reaches the other, whatever their distance."""
         if sender in self.silent or receiver in self.deaf:
             return True
+        if not self.partition:
+            return False
         of_one = [group for group in self.partition if sender in group]
         of_other = [group for group in self.partition if receiver in group]
         return bool(of_one and of_other and of_one != of_other)

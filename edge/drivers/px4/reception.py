@@ -8,7 +8,7 @@ is late, the vehicle's own time does, of those messages that have it.
 """
 
 import math
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Hashable
 from enum import Enum
 from typing import NamedTuple
@@ -112,8 +112,9 @@ class VehicleFrames:
         # Of each message that has the vehicle's time: that of the newest, when it came, and whence.
         self._newest: dict[int, tuple[float, float, Hashable]] = {}
         self._latest_s = -math.inf
-        # Of each content: when it was taken, by which path, and of which stream; oldest first.
-        self._taken: dict[Hashable, tuple[float, Hashable, _Stream | None]] = {}
+        # Of each content: when it was taken, by which path, and of which stream; oldest first. A
+        # dict that is emptied from its front takes ever longer to find that.
+        self._taken: OrderedDict[Hashable, tuple[float, Hashable, _Stream | None]] = OrderedDict()
         self._seconds: deque[_Second] = deque(maxlen=_LOSS_S + 1)
 
     def take(self, frame: Frame, now_s: float) -> bool:
@@ -140,9 +141,8 @@ class VehicleFrames:
         if is_old or sort is not _Sort.NEXT:
             return False
         second.taken += 1
-        # A key that is assigned to again would keep its old place.
-        self._taken.pop(frame.content, None)
         self._taken[frame.content] = now_s, frame.path, stream
+        self._taken.move_to_end(frame.content)
         if frame.vehicle_s is not None:
             second.timed += 1
             self._newest[frame.message_id] = frame.vehicle_s, now_s, frame.path

@@ -4,7 +4,7 @@ onnxruntime's numbers differ in the last bits from one type of CPU to another, a
 goes another way. Their flight logs hold what the robots' policies made of it.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,51 +13,18 @@ from edge.core import F32
 from edge.core.part import PartError
 from edge.core.wire import Rejection, decode
 from edge.drivers.flight_log import read, read_metadata
-from edge.policy.bundle import Manifest
-from edge.policy.family import GoldenCheck, Observation, Perceived, Policy, PolicyStep
+from edge.policy.family import Observation, Perceived, Policy, PolicyStep
 
 
 class RecordingError(ValueError):
     """The logs are not those of this flight; the text says which, and why."""
 
 
-class RecordedPolicy:
-    """One robot's policy, of which each step is as its log has it. See `Policy`."""
-
-    def __init__(self, policy: Policy, steps: "RecordedSteps", unix_s: Callable[[], float]) -> None:
-        """`policy` is the one that flew; `unix_s` is the simulated wall clock."""
-        self._policy = policy
-        self._steps = steps
-        self._unix_s = unix_s
-
-    @property
-    def manifest(self) -> Manifest:
-        """The bundle's."""
-        return self._policy.manifest
-
-    @property
-    def bundle_id(self) -> bytes:
-        """The bundle's."""
-        return self._policy.bundle_id
-
-    @property
-    def message_size(self) -> int:
-        """The policy's."""
-        return self._policy.message_size
-
-    def agent(self) -> "RecordedAgent":
-        """What has its steps from the log."""
-        return RecordedAgent(self._steps, self._unix_s)
-
-    def verify(self) -> Iterator[GoldenCheck]:
-        """Nothing is computed."""
-        return iter(())
-
-
 class RecordedAgent:
-    """See `edge.policy.family.Agent`."""
+    """One robot's agent, of which each step is as its log has it."""
 
     def __init__(self, steps: "RecordedSteps", unix_s: Callable[[], float]) -> None:
+        """`unix_s` is the simulated wall clock."""
         self._steps = steps
         self._unix_s = unix_s
 

@@ -21,12 +21,14 @@ from edge.identity.guard import Guard, Unguarded
 from edge.messages.mission import RobotStatus
 from edge.messages.topics import Link
 from edge.policy.family import VerifiedPolicy, verified
+from edge.policy.lpac.policy import LpacPolicy
 from edge.robot.config import RobotConfig, load_config
 from edge.robot.log import open_log
 from edge.robot.node import Ports, RobotNode
 from lpac.sim.air import Subscriptions
+from lpac.sim.fleet.agents import DeferredAgent, PolicyWithAgents
 from lpac.sim.fleet.layout import Layout, Settings
-from lpac.sim.fleet.recorded import RecordedPolicy, recorded_steps
+from lpac.sim.fleet.recorded import RecordedAgent, recorded_steps
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.scenario import Scenario
 from lpac.sim.schedule import Recurrence, Schedule, WallClock
@@ -284,11 +286,15 @@ class SimulatedRobots:
         )
 
     def _policy_of(self, robot_id: int) -> VerifiedPolicy:
-        if self._recorded is None:
-            return self._policy
         policy = self._policy.policy
-        steps = recorded_steps(self._recorded, robot_id, policy)
-        return verified(RecordedPolicy(policy, steps, self.schedule.unix_s))
+        if self._recorded is not None:
+            steps = recorded_steps(self._recorded, robot_id, policy)
+            recorded = partial(RecordedAgent, steps, self.schedule.unix_s)
+            return verified(PolicyWithAgents(policy, recorded))
+        if self._logs or not isinstance(policy, LpacPolicy):
+            return self._policy
+        deferred = partial(DeferredAgent, policy)
+        return VerifiedPolicy(PolicyWithAgents(policy, deferred), self._policy.problem)
 
     def _open_link(self, robot: SimulatedRobot, subscriptions: Subscriptions) -> OpenLink:
         raise NotImplementedError

@@ -1,0 +1,60 @@
+"""Other agents under a robot's policy than the policy's own."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from edge.core import F32
+from edge.policy.bundle import Manifest
+from edge.policy.family import Agent, GoldenCheck, Observation, Perceived, Policy, PolicyStep
+from edge.policy.lpac.policy import LpacAgent
+
+
+class PolicyWithAgents:
+    """A policy that was tried, with agents made by `agent`. See `Policy`."""
+
+    def __init__(self, policy: Policy, agent: Callable[[], Agent]) -> None:
+        self._policy = policy
+        self.agent = agent
+
+    @property
+    def manifest(self) -> Manifest:
+        """The bundle's."""
+        return self._policy.manifest
+
+    @property
+    def bundle_id(self) -> bytes:
+        """The bundle's."""
+        return self._policy.bundle_id
+
+    @property
+    def message_size(self) -> int:
+        """The policy's."""
+        return self._policy.message_size
+
+    def verify(self) -> Iterator[GoldenCheck]:
+        """Nothing is computed anew."""
+        return iter(())
+
+
+class DeferredAgent(LpacAgent):
+    """Computes features once it decides: of two observations between, one is of no use.
+
+    The steps are those of `LpacAgent`. What it perceived cannot be logged.
+    """
+
+    _seen: Observation | None = None
+    _features: F32 = np.zeros(0, np.float32)
+
+    def observe(self, observation: Observation) -> Perceived:
+        """Keep the observation, and give no features."""
+        position, local_map, neighbours, velocity = observation
+        # The map's array is used again.
+        self._seen = Observation(position, local_map.copy(), neighbours, velocity)
+        return Perceived(np.zeros(0, np.float32), {})
+
+    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+        """Of the last observation, whose place `features` take."""
+        if self._seen is not None:
+            self._features, self._seen = super().observe(self._seen).features, None
+        return super().step(self._features, payloads, degree)
