@@ -5,12 +5,14 @@ import os
 import platform
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.fields import options_of
 from lpac.cli.options import AsJson
 from lpac.cli.printing import print_table, progress_of
 
@@ -35,9 +37,10 @@ def bench() -> None:
     """So that `network` is a command of its own."""
 
 
-@app.command()
-def network(
-    *,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetworkOptions:
+    """What is measured, how often, and where."""
+
     experiments: Annotated[
         list[str] | None,
         typer.Argument(
@@ -45,7 +48,7 @@ def network(
             help="restarts: throughput while programs restart; robots: throughput and age of "
             "messages over the number of robots; both if none is given.",
         ),
-    ] = None,
+    ] = None
     middlewares: Annotated[
         list[str] | None,
         typer.Option(
@@ -54,21 +57,20 @@ def network(
             help="zenoh, cyclonedds, and fastdds where it is installed, if not given; may be "
             "repeated. The stream without any programs is always measured, too.",
         ),
-    ] = None,
+    ] = None
     robots: Annotated[
         int | None,
         typer.Option(
-            "--robots",
-            "-n",
+            "--robots", "-n",
             help="How many robots restart (3 if not given), and up to how many the curves go (10).",
         ),
-    ] = None,
+    ] = None  # fmt: skip
     repetitions: Annotated[
-        int | None, typer.Option(help="If not given, 10 of restarts, 3 of each point of a curve.")
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="Length of a run: 60 with restarts, else 10, by default.")
-    ] = None,
+        int | None, "If not given, 10 of restarts, 3 of each point of a curve."
+    ] = None
+    seconds: Annotated[float | None, "Length of a run: 60 with restarts, else 10, by default."] = (
+        None
+    )
     namespaces: Annotated[
         str | None,
         typer.Option(
@@ -76,20 +78,21 @@ def network(
             help="Network namespaces, one for each robot, two at least; else this machine's "
             "loopback, which has no radio.",
         ),
-    ] = None,
-    as_json: AsJson = False,
-    out: Annotated[Path, typer.Option(help="Folder for network.json and figures.")] = _OUT,
-) -> None:
+    ] = None
+    as_json: AsJson = False
+    out: Annotated[Path, "Folder for network.json and figures."] = _OUT
+
+
+@app.command()
+@options_of(NetworkOptions)
+def network(of: NetworkOptions) -> None:
     """The paper's network experiments: what a bulk stream gets beside the robots' programs."""
     from lpac.middleware.results import as_json as to_json
     from lpac.train.files import write_atomically
 
-    chosen = _checked(middlewares)
-    plans = [
-        _plan(experiment, chosen, robots, repetitions, seconds)
-        for experiment in _experiments(experiments)
-    ]
-    places = _places(namespaces, max(plan.places for plan in plans))
+    chosen = _checked(of.middlewares)
+    plans = [_plan(experiment, chosen, of) for experiment in _experiments(of.experiments)]
+    places = _places(of.namespaces, max(plan.places for plan in plans))
     where = _measured_on(places, plans[0])
     runs: list[Run] = []
     with closing(_measure(plans, places)) as measured:
@@ -97,12 +100,12 @@ def network(
             runs.append(run)
             # An interrupted measurement leaves what it has.
             told = json.dumps(to_json(where, runs), indent=2)
-            write_atomically(out / "network.json", f"{told}\n".encode())
-    _draw(runs, out)
-    if as_json:
+            write_atomically(of.out / "network.json", f"{told}\n".encode())
+    _draw(runs, of.out)
+    if of.as_json:
         typer.echo(json.dumps(to_json(where, runs), indent=2))
     else:
-        _show(where, runs, out)
+        _show(where, runs, of.out)
 
 
 def _experiments(given: Sequence[str] | None) -> list["Experiment"]:
@@ -134,15 +137,10 @@ def _checked(given: Sequence[str] | None) -> tuple[str, ...]:
     return (*chosen, NOTHING)
 
 
-def _plan(
-    experiment: "Experiment",
-    middlewares: tuple[str, ...],
-    robots: int | None,
-    repetitions: int | None,
-    seconds: float | None,
-) -> "Plan":
+def _plan(experiment: "Experiment", middlewares: tuple[str, ...], of: NetworkOptions) -> "Plan":
     from lpac.middleware.measure import Plan
 
+    robots, repetitions, seconds = of.robots, of.repetitions, of.seconds
     its_robots, its_repetitions, its_seconds = _RESTARTS if experiment == "restarts" else _ROBOTS
     fleet = its_robots if robots is None else robots
     least = 2 if experiment == "restarts" else 1
@@ -163,7 +161,7 @@ def _plan(
 
 def require_namespaces(namespaces: str | None, robots: int | None) -> None:
     """Raises ValueError, OSError if all experiments with so many robots could not run there."""
-    plans = [_plan(each, (), robots, None, None) for each in _experiments(None)]
+    plans = [_plan(each, (), NetworkOptions(robots=robots)) for each in _experiments(None)]
     _places(namespaces, max(plan.places for plan in plans))
 
 

@@ -3,11 +3,14 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lpac.cli.apps import new_app
+
+if TYPE_CHECKING:
+    from edge.policy.bundle import Manifest
 
 app = new_app("bundle", "Look at a policy bundle; verify or time it on this machine.")
 
@@ -20,56 +23,57 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 @app.command()
 def info(path: BundlePath, as_json: AsJson = False) -> None:
     """Print what the bundle holds: geometry, perception, training, origin."""
-    from edge.policy.bundle import LPAC, MANIFEST, load_bundle
-    from edge.policy.lpac.manifest import LpacManifest
+    from edge.policy.bundle import MANIFEST, load_bundle
 
     bundle = load_bundle(path)
-    manifest = bundle.manifest
+    manifest, training = bundle.manifest, bundle.manifest.training
     if as_json:
         typer.echo(json.dumps({"id": bundle.id, **json.loads(bundle.files[MANIFEST])}, indent=2))
         return
-    perception, training = manifest.perception, manifest.training
-    rows = [("name", manifest.name), ("id", bundle.id), ("family", manifest.family)]
-    if manifest.family == LPAC:
-        lpac = LpacManifest.of(manifest)
-        geometry, images = lpac.geometry, lpac.images
-        sizes = " -> ".join(map(str, geometry.feature_sizes))
-        rows += [
-            ("network", f"L = {geometry.layers} layers ({sizes}), K = {geometry.hops} hops"),
-            (
-                "message",
-                f"{geometry.message_size} values: {4 * geometry.message_size:,} B in float32, "
-                f"{2 * geometry.message_size:,} B in float16",
-            ),
-        ]
-        if images:
-            rows.append(("images", f"{', '.join(images.channels)}: {images.size} x {images.size}"))
-    else:
-        rows += [(key, json.dumps(value)) for key, value in sorted(manifest.parameters.items())]
-    if perception and perception.shared_map_cell:
-        side, cell = perception.shared_map_side, perception.shared_map_cell
-        rows.append(("shared map", f"{side} x {side} cells of {cell}: {side * side:,} B more"))
-    if perception:
-        rows.append(
-            (
-                "perception",
-                f"world {perception.world_size}, local map {perception.local_map_size}, "
-                f"sensor {perception.sensor_size}, range {perception.communication_range:g}",
-            )
-        )
-    else:
-        rows.append(("perception", "none: graph neural network and action only"))
-    rows += [
+    rows = [
+        ("name", manifest.name),
+        ("id", bundle.id),
+        ("family", manifest.family),
+        *_network(manifest),
+        *_perception(manifest),
         ("trained for", f"{training.max_speed:g} units/s, time step {training.time_step:g} s"),
-        *(
-            (key, value)
-            for key, value in sorted(manifest.provenance.items())
-            if "sha256" not in key
-        ),
+        *((k, value) for k, value in sorted(manifest.provenance.items()) if "sha256" not in k),
         *((name, f"{len(bundle.files[name]):,} B") for name in manifest.files),
     ]
     for label, value in rows:
         typer.echo(f"{label:12} {value}")
+
+
+def _network(manifest: "Manifest") -> list[tuple[str, str]]:
+    """The geometry of the family lpac, the parameters of others."""
+    from edge.policy.bundle import LPAC
+    from edge.policy.lpac.manifest import LpacManifest
+
+    if manifest.family != LPAC:
+        return [(key, json.dumps(value)) for key, value in sorted(manifest.parameters.items())]
+    lpac = LpacManifest.of(manifest)
+    geometry, images = lpac.geometry, lpac.images
+    sizes, values = " -> ".join(map(str, geometry.feature_sizes)), geometry.message_size
+    rows = [
+        ("network", f"L = {geometry.layers} layers ({sizes}), K = {geometry.hops} hops"),
+        ("message", f"{values} values: {4 * values:,} B in float32, {2 * values:,} B in float16"),
+    ]
+    if images:
+        rows.append(("images", f"{', '.join(images.channels)}: {images.size} x {images.size}"))
+    return rows
+
+
+def _perception(manifest: "Manifest") -> list[tuple[str, str]]:
+    perception = manifest.perception
+    if perception is None:
+        return [("perception", "none: graph neural network and action only")]
+    rows = []
+    if perception.shared_map_cell:
+        side, cell = perception.shared_map_side, perception.shared_map_cell
+        rows.append(("shared map", f"{side} x {side} cells of {cell}: {side * side:,} B more"))
+    sizes = f"world {perception.world_size}, local map {perception.local_map_size}"
+    senses = f"sensor {perception.sensor_size}, range {perception.communication_range:g}"
+    return [*rows, ("perception", f"{sizes}, {senses}")]
 
 
 @app.command()

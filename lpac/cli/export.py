@@ -1,13 +1,16 @@
 """`lpac export`: a trained torch checkpoint becomes a bundle."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lpac.cli.apps import new_app
 from lpac.cli.options import found
 from lpac.cli.printing import working
+
+if TYPE_CHECKING:
+    from edge.policy.bundle import Bundle
 
 app = new_app()
 
@@ -46,12 +49,16 @@ def export(
 ) -> None:
     """Export a trained torch checkpoint as a bundle that runs without torch."""
     from edge.policy.bundle import write_bundle
-    from edge.policy.lpac.manifest import LpacManifest
     from export.exporter import export_bundle
 
     with working("exporting"):
         bundle = export_bundle(checkpoint, params, name, cnn=cnn, force=force)
     write_bundle(bundle, output)
+    _show(bundle, output)
+
+
+def _show(bundle: "Bundle", output: Path) -> None:
+    from edge.policy.lpac.manifest import LpacManifest
 
     manifest, lpac = bundle.manifest, LpacManifest.of(bundle.manifest)
     geometry, images = lpac.geometry, lpac.images

@@ -18,9 +18,9 @@ _UNITS = ("_m_s", "_s", "_m")
 def options_of(*classes: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorate a command that takes an instance of each of these dataclasses, in their order.
 
-    Its options are their fields. A field's type is `Annotated`, with a text for the option's help,
-    or with a `typer.Option` or `typer.Argument`. An option that has no name gets the field's,
-    without its unit.
+    Its options are their fields, and its own keyword-only parameters, as typer has them. A field's
+    type is `Annotated`, with a text for the option's help, or with a `typer.Option` or
+    `typer.Argument`. An option that has no name gets the field's, without its unit.
 
     The command raises ValueError that names the option if a value is out of its field's bounds.
     """
@@ -29,18 +29,23 @@ def options_of(*classes: type[Any]) -> Callable[[Callable[..., None]], Callable[
     flags = {each.name: str(each.annotation.__metadata__[0].default) for each in parameters}
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        declared = inspect.signature(command).parameters.values()
+        own = [each for each in declared if each.kind is inspect.Parameter.KEYWORD_ONLY]
+
         @wraps(command)
         def called(**given: Any) -> None:
             from edge.core.schema import require
 
+            further = {each.name: given.pop(each.name) for each in own if each.name in given}
             for name, value in given.items():
                 require(hints[name], value, flags[name])
                 if _choices(hints[name]) and value is not None:
                     given[name] = str(value)
-            command(*(cls(**_own(cls, given)) for cls in classes))
+            command(*(cls(**_own(cls, given)) for cls in classes), **further)
 
-        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        called.__annotations__ = {each.name: each.annotation for each in parameters}
+        options = [*parameters, *own]
+        called.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+        called.__annotations__ = {each.name: each.annotation for each in options}
         return called
 
     return decorate

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from lpac.ground.site import Standing
     from lpac.ground.station.protocol import CommandProgress, CommandReport, Request
     from lpac.ground.station.subscriber import GroundSubscriber
+
+
+ListenSeconds = Annotated[
+    float, typer.Option("--seconds", min=0.5, max=600, help="How long to listen.")
+]
 
 
 class Addressed(NamedTuple):

@@ -45,17 +45,10 @@ def hosts(
             count, out, image=image, bundle=bundle, spares=spares, say=typer.echo
         ) as running:
             _give_to_user(out)
-            fleet = f"--fleet {running.fleet_toml}"
             typer.echo(f"fleet {running.fleet}; Ctrl-C ends all; in another terminal:")
-            for line in (
-                f"lpac fleet enroll {fleet}",
-                f"lpac fleet deploy {fleet}",
-                f"lpac fleet status {fleet}",
-                f"lpac fleet stop {fleet}",
-                f"lpac fleet start {fleet}",
-                f"ssh -F {running.ssh_config} {running[0].name}",
-            ):
-                typer.echo(f"  {line}")
+            for command in ("enroll", "deploy", "status", "stop", "start"):
+                typer.echo(f"  lpac fleet {command} --fleet {running.fleet_toml}")
+            typer.echo(f"  ssh -F {running.ssh_config} {running[0].name}")
             while True:
                 time.sleep(_FORGET_EVERY_S)
                 for host in running:

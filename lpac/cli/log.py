@@ -10,6 +10,9 @@ from lpac.cli.apps import new_app
 
 app = new_app("log", "What the robots' and the ground's logs hold.")
 
+# By name and boot nonce of the program, and trial.
+_Uptimes = dict[tuple[str, str, str], tuple[float, float]]
+
 
 @app.command()
 def trials(
@@ -20,30 +23,16 @@ def trials(
 
     In JSON: file -> trial -> [first, last] Unix time, s; the time without a trial is under "".
     """
-    from edge.drivers.flight_log import FlightLogError, read
+    from edge.drivers.flight_log import FlightLogError
 
-    # Robots' clocks may be set meanwhile, and never go back in uptime: file -> (program, trial) ->
-    # first and last uptime, and when each program began, by its clock as it was at last.
-    uptimes: dict[Path, dict[tuple[str, str, str], tuple[float, float]]] = {}
+    uptimes: dict[Path, _Uptimes] = {}
     began_s: dict[tuple[str, str], float] = {}
     for path in sorted(folder.rglob("*.mcap")):
-        times: dict[tuple[str, str, str], tuple[float, float]] = {}
         try:
-            for _, time_s, status in read(path, "status", missing=_say):
-                uptime_s = status.get("uptime_s")
-                program = (path.stem.rpartition("-")[0], str(status.get("boot_nonce")))
-                if not (isinstance(uptime_s, float | int) and 0.0 <= uptime_s <= time_s):
-                    # What tells none goes by its clock alone.
-                    program, uptime_s = (program[0], ""), time_s
-                began_s[program] = time_s - uptime_s
-                key = (*program, str(status.get("trial", "")))
-                first_s, last_s = times.get(key, (uptime_s, uptime_s))
-                times[key] = (min(first_s, uptime_s), max(last_s, uptime_s))
+            uptimes[path] = _uptimes(path, began_s)
         except FlightLogError as error:
             # Perhaps the power went before the first byte of it was on the disk.
             _say(f"{error}: left out")
-            continue
-        uptimes[path] = times
     found: dict[str, dict[str, tuple[float, float]]] = {}
     for path, times in uptimes.items():
         trials = found[str(path.relative_to(folder))] = {}
@@ -57,6 +46,28 @@ def trials(
     for file, trials in found.items():
         for trial, (first_s, last_s) in trials.items():
             typer.echo(f"{file}  {_span(first_s, last_s)}  {trial or '-'}")
+
+
+def _uptimes(path: Path, began_s: dict[tuple[str, str], float]) -> _Uptimes:
+    """First and last uptime of each program and trial in a file, s. Raises FlightLogError.
+
+    Robots' clocks may be set meanwhile; uptime never goes back. `began_s` gets when each program
+    began, by its clock as it was at last.
+    """
+    from edge.drivers.flight_log import read
+
+    times: _Uptimes = {}
+    for _, time_s, status in read(path, "status", missing=_say):
+        uptime_s = status.get("uptime_s")
+        program = (path.stem.rpartition("-")[0], str(status.get("boot_nonce")))
+        if not (isinstance(uptime_s, float | int) and 0.0 <= uptime_s <= time_s):
+            # What tells none goes by its clock alone.
+            program, uptime_s = (program[0], ""), time_s
+        began_s[program] = time_s - uptime_s
+        key = (*program, str(status.get("trial", "")))
+        first_s, last_s = times.get(key, (uptime_s, uptime_s))
+        times[key] = (min(first_s, uptime_s), max(last_s, uptime_s))
+    return times
 
 
 @app.command()

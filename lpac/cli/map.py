@@ -1,33 +1,43 @@
 """`lpac map`: the live map, a page for the browser of the laptop."""
 
-from typing import Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.fields import options_of
 from lpac.cli.options import DEFAULT_FLEET, Fleet
+
+if TYPE_CHECKING:
+    import ssl
+
+    from lpac.fleet.settings import FleetConfig
+    from lpac.ground.map.access import Access
 
 app = new_app()
 
 
-@app.command("map")
-def live_map(
-    fleet: Fleet = DEFAULT_FLEET,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 8300,
-    host: Annotated[
-        str, typer.Option(help="Where to serve; beyond this machine it asks for a token.")
-    ] = "127.0.0.1",
-    operate: Annotated[
-        bool, typer.Option("--operate", help="Also command the fleet from the page.")
-    ] = False,
-    token: Annotated[
-        str | None, typer.Option(help="The token; if not given, one is made where needed.")
-    ] = None,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapOptions:
+    """Where the page is served, and what it may do."""
+
+    fleet: Fleet = DEFAULT_FLEET
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = (
+        8300
+    )
+    host: Annotated[str, "Where to serve; beyond this machine it asks for a token."] = "127.0.0.1"
+    operate: Annotated[bool, "Also command the fleet from the page."] = False
+    token: Annotated[str | None, "The token; if not given, one is made where needed."] = None
     over_tls: Annotated[
         bool, typer.Option("--tls", help="Serve over TLS, from the laptop with the authority.")
-    ] = False,
-    open_page: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
-) -> None:
+    ] = False
+    open_page: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False
+
+
+@app.command("map")
+@options_of(MapOptions)
+def live_map(page: MapOptions) -> None:
     """Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.
 
     It only observes, unless --operate is given; then it asks for a token, which is part of the
@@ -35,57 +45,71 @@ def live_map(
     browser has to import the authority once.
     """
     import asyncio
-    import datetime
-    import re
-    import secrets
-    import ssl
-    import webbrowser
 
-    from edge.core.address import is_loopback, require_host
+    from edge.core.address import require_host
     from lpac.fleet.settings import load_fleet
-    from lpac.ground.map.access import Access, reached_at
     from lpac.ground.map.server import serve
-    from lpac.ground.station.client import subscribe
 
-    require_host("--host", host)
-    config = load_fleet(fleet)
-    if token is not None and re.fullmatch(r"[A-Za-z0-9_-]+", token) is None:
-        raise ValueError("--token: must be letters, digits, '-' and '_'")
-    if host == "::":
-        # asyncio would serve IPv6 alone, of which a field's network has no address to open.
-        host = "0.0.0.0"
-    local = is_loopback(host)
-    if token is None and (operate or not local):
-        token = secrets.token_urlsafe(16)
-    context = None
-    if over_tls:
-        from lpac.fleet.cards import open_authority
-        from lpac.fleet.web_certificate import web_certificate
-
-        addresses = ["127.0.0.1" if a == "localhost" else a for a in reached_at(host)]
-        files = web_certificate(
-            open_authority(config), addresses, datetime.datetime.now(datetime.UTC)
-        )
-        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-        context.load_cert_chain(files.certificate, files.key)
-        typer.echo(f"browsers import {files.authority}")
-
-    def ready(addresses: list[str]) -> None:
-        for address in addresses:
-            typer.echo(f"map of {config.fleet}: {address}")
-        typer.echo("commands the fleet" if operate else "only observes; --operate commands")
-        typer.echo("Ctrl-C ends it, and nothing else")
-        try:
-            with subscribe(config.fleet):
-                pass
-        except OSError as error:
-            typer.echo(f"{error}; until then the map shows nothing")
-        if open_page:
-            webbrowser.open(addresses[0])
-
+    require_host("--host", page.host)
+    config = load_fleet(page.fleet)
+    # With "::" asyncio would serve IPv6 alone, of which a field's network has no address to open.
+    host = "0.0.0.0" if page.host == "::" else page.host
+    access = _access(host, page)
     asyncio.run(
         serve(
-            config.fleet, host=host, port=port, operate=operate, tls=context, ready=ready,
-            access=Access(local, token, "https" if over_tls else "http"),
+            config.fleet, host=host, port=page.port, operate=page.operate, access=access,
+            tls=_tls(config, host) if page.over_tls else None,
+            ready=lambda addresses: _on_ready(config.fleet, addresses, page),
         )
     )  # fmt: skip
+
+
+def _access(host: str, page: MapOptions) -> "Access":
+    """Raises ValueError."""
+    import re
+    import secrets
+
+    from edge.core.address import is_loopback
+    from lpac.ground.map.access import Access
+
+    token, local = page.token, is_loopback(host)
+    if token is not None and re.fullmatch(r"[A-Za-z0-9_-]+", token) is None:
+        raise ValueError("--token: must be letters, digits, '-' and '_'")
+    if token is None and (page.operate or not local):
+        token = secrets.token_urlsafe(16)
+    return Access(local, token, "https" if page.over_tls else "http")
+
+
+def _tls(config: "FleetConfig", host: str) -> "ssl.SSLContext":
+    """With a certificate by the fleet's authority. Raises AuthorityError."""
+    import datetime
+    import ssl
+
+    from lpac.fleet.cards import open_authority
+    from lpac.fleet.web_certificate import web_certificate
+    from lpac.ground.map.access import reached_at
+
+    addresses = ["127.0.0.1" if a == "localhost" else a for a in reached_at(host)]
+    files = web_certificate(open_authority(config), addresses, datetime.datetime.now(datetime.UTC))
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.load_cert_chain(files.certificate, files.key)
+    typer.echo(f"browsers import {files.authority}")
+    return context
+
+
+def _on_ready(fleet: str, addresses: list[str], page: MapOptions) -> None:
+    import webbrowser
+
+    from lpac.ground.station.client import subscribe
+
+    for address in addresses:
+        typer.echo(f"map of {fleet}: {address}")
+    typer.echo("commands the fleet" if page.operate else "only observes; --operate commands")
+    typer.echo("Ctrl-C ends it, and nothing else")
+    try:
+        with subscribe(fleet):
+            pass
+    except OSError as error:
+        typer.echo(f"{error}; until then the map shows nothing")
+    if page.open_page:
+        webbrowser.open(addresses[0])

@@ -2,6 +2,7 @@
 
 import getpass
 import socket
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -39,6 +40,15 @@ DEFAULT_SENSOR = "world"
 DEFAULT_ROBOTS = 10
 # The name of a lock has some hundred bytes.
 _LOCK_BYTES = 80
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OfFleet:
+    """Options of a command for robots of a fleet."""
+
+    fleet: Fleet = DEFAULT_FLEET
+    robots: Robots = None
+    as_json: AsJson = False
 
 
 class VehicleKind(StrEnum):

@@ -2,8 +2,9 @@
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -39,6 +40,17 @@ _QUICK_NETWORK = (3, 1, 8.0)
 _Out = Annotated[
     Path | None,
     typer.Option(help="Folder for figures, data and README.md; out/paper/NAME if none."),
+]
+_Worlds = Annotated[
+    int | None,
+    typer.Option(
+        "--worlds", "-k",
+        help="How many of the validation set, from the first on; else as the study has it, "
+        "and a fifth of it, or one in real time, for whole robots in `async` and `transfer`.",
+    ),
+]  # fmt: skip
+_World = Annotated[
+    int | None, typer.Option(help="Number of the world, of the validation set; else 0.")
 ]
 _Quick = Annotated[bool, typer.Option("--quick", help="A small version that takes minutes.")]
 _Namespaces = Annotated[
@@ -83,89 +95,57 @@ class ExperimentOptions:
     out: _Out = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Worlds:
-    """How many worlds."""
-
-    worlds: Annotated[
-        int | None,
-        typer.Option(
-            "--worlds", "-k",
-            help="How many of the validation set, from the first on; else as the study has it, "
-            "and a fifth of it, or one in real time, for whole robots in `async` and `transfer`.",
-        ),
-    ] = None  # fmt: skip
+@app.command()
+@options_of(ExperimentOptions)
+def e1(flown: ExperimentOptions, *, worlds: _Worlds = None) -> None:
+    """Transferability: unseen worlds from the same starts, beside baselines."""
+    _experiment("e1", flown, {"worlds": worlds})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OneWorld:
-    """Which world."""
-
-    world: Annotated[int | None, "Number of the world, of the validation set; else 0."] = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trials:
-    """How often."""
-
-    trials: Annotated[int | None, "How many trials; else 3."] = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Quick:
-    """How much."""
-
-    quick: _Quick = False
+@app.command()
+@options_of(ExperimentOptions)
+def e2(
+    flown: ExperimentOptions,
+    *,
+    trials: Annotated[int | None, typer.Option(help="How many trials; else 3.")] = None,
+    world: _World = None,
+) -> None:
+    """Repeatability: one world again and again, starts and GPS a little off."""
+    if trials is not None and trials < 2:
+        raise ValueError(f"--trials {trials}: must be at least 2")
+    _experiment("e2", flown, {"trials": trials, "first_world": world})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetUps:
-    """In which teams and worlds."""
+@app.command()
+@options_of(ExperimentOptions)
+def e3(flown: ExperimentOptions, *, world: _World = None) -> None:
+    """Perturbation: robots are taken away at steady state, and brought back."""
+    _experiment("e3", flown, {"first_world": world})
 
+
+@app.command("async")
+@options_of(ExperimentOptions)
+def asynchrony(flown: ExperimentOptions, *, worlds: _Worlds = None, quick: _Quick = False) -> None:
+    """Rates of perception and of messages, in step or not, and late messages: what they cost."""
+    _experiment("async", flown, {"worlds": worlds}, quick=quick)
+
+
+@app.command()
+@options_of(ExperimentOptions)
+def transfer(
+    flown: ExperimentOptions,
+    *,
+    worlds: _Worlds = None,
     set_ups: Annotated[
         list[str] | None,
         typer.Option(
             "--set-up", metavar="NAME", help="Only this one (docs/research.md); may be repeated."
         ),
-    ] = None
-
-
-@app.command()
-@options_of(ExperimentOptions, Worlds)
-def e1(flown: ExperimentOptions, worlds: Worlds) -> None:
-    """Transferability: unseen worlds from the same starts, beside baselines."""
-    _experiment("e1", flown, {"worlds": worlds.worlds})
-
-
-@app.command()
-@options_of(ExperimentOptions, Trials, OneWorld)
-def e2(flown: ExperimentOptions, trials: Trials, world: OneWorld) -> None:
-    """Repeatability: one world again and again, starts and GPS a little off."""
-    if trials.trials is not None and trials.trials < 2:
-        raise ValueError(f"--trials {trials.trials}: must be at least 2")
-    _experiment("e2", flown, {"trials": trials.trials, "first_world": world.world})
-
-
-@app.command()
-@options_of(ExperimentOptions, OneWorld)
-def e3(flown: ExperimentOptions, world: OneWorld) -> None:
-    """Perturbation: robots are taken away at steady state, and brought back."""
-    _experiment("e3", flown, {"first_world": world.world})
-
-
-@app.command("async")
-@options_of(ExperimentOptions, Worlds, Quick)
-def asynchrony(flown: ExperimentOptions, worlds: Worlds, quick: Quick) -> None:
-    """Rates of perception and of messages, in step or not, and late messages: what they cost."""
-    _experiment("async", flown, {"worlds": worlds.worlds}, quick=quick.quick)
-
-
-@app.command()
-@options_of(ExperimentOptions, Worlds, SetUps, Quick)
-def transfer(flown: ExperimentOptions, worlds: Worlds, set_ups: SetUps, quick: Quick) -> None:
+    ] = None,
+    quick: _Quick = False,
+) -> None:
     """Other numbers of robots, features and ranges: `lpac evaluate` in the paper's set-ups."""
-    changes = {"worlds": worlds.worlds, "set_ups": set_ups.set_ups}
-    _experiment("transfer", flown, changes, quick=quick.quick)
+    _experiment("transfer", flown, {"worlds": worlds, "set_ups": set_ups}, quick=quick)
 
 
 _OPTIONS = {"worlds": "--worlds", "trials": "--trials", "first_world": "--world",
@@ -443,26 +423,31 @@ def everything(
     folder, loaded = out or _OUT, load_bundle(bundle)
     # Known before hours of flights.
     require_namespaces(namespaces, _QUICK_NETWORK[0] if quick else None)
-    whole = VehicleKind.POINT if quick else VehicleKind.SIMULATED
     told = {}
-    for name in ("e1", "e2", "e3", "transfer", "async", "network"):
-        vehicle, small = (
-            (whole, False) if name in ("e1", "e2", "e3") else (VehicleKind.POINT, quick)
-        )
-        made = [*_vehicle(vehicle), *(["--quick"] if small else [])]
-        ids = [loaded.id]
-        if name == "network":
-            made, ids = _for_network(namespaces, quick=quick), []
-        told[name] = made_by(" ".join(["paper", name, *made]), ids)
-        kept = folder / name / _MADE_FOR_ALL
-        if kept.exists() and json.loads(kept.read_text()) == told[name]:
-            continue
-        typer.echo(f"{name}\n")
-        if name == "network":
-            network(quick=quick, namespaces=namespaces, out=folder / name)
-        else:
-            flown = ExperimentOptions(bundles=[bundle], vehicle=vehicle, ray=ray, out=folder / name)
-            _experiment(name, flown, {}, quick=small)
-        typer.echo()
-        kept.write_text(json.dumps(told[name]) + "\n")
+    for name in ("e1", "e2", "e3", "transfer", "async"):
+        flown = ExperimentOptions(bundles=[bundle], ray=ray, out=folder / name)
+        small = quick and name in ("transfer", "async")
+        if not quick and name in ("e1", "e2", "e3"):
+            flown = replace(flown, vehicle=VehicleKind.SIMULATED)
+        command = ["paper", name, *_vehicle(flown.vehicle), *(["--quick"] if small else [])]
+        told[name] = made_by(" ".join(command), [loaded.id])
+        fly = partial(_experiment, name, flown, {}, quick=small)
+        _unless_made(name, folder / name, told[name], fly)
+    command = ["paper network", *_for_network(namespaces, quick=quick)]
+    told["network"] = made_by(" ".join(command), [])
+    measure = partial(network, quick=quick, namespaces=namespaces, out=folder / "network")
+    _unless_made("network", folder / "network", told["network"], measure)
     typer.echo(f"see {write_page(folder, loaded, told)}")
+
+
+def _unless_made(
+    name: str, folder: Path, made_by: dict[str, str], make: Callable[[], None]
+) -> None:
+    """Results are made again only if they were made otherwise."""
+    kept = folder / _MADE_FOR_ALL
+    if kept.exists() and json.loads(kept.read_text()) == made_by:
+        return
+    typer.echo(f"{name}\n")
+    make()
+    typer.echo()
+    kept.write_text(json.dumps(made_by) + "\n")

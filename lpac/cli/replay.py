@@ -2,13 +2,14 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.options import AsJson
 from lpac.cli.printing import working
 
 if TYPE_CHECKING:
@@ -24,6 +25,20 @@ _MOST_ROWS = 20
 _ROUNDS = "another kind of processor rounds otherwise in the last digits, the same one does not"
 
 
+class _RunAgain(NamedTuple):
+    """What came of it: of the policy, if it ran, and of the flight by segment of the logs."""
+
+    metadata: "Mapping[Path, FlightMetadata]"
+    bundle: "Bundle | None"
+    comparisons: "tuple[Comparison, ...]"
+    flights: "Mapping[Path, FlightReplay]"
+    missing: "Sequence[Missing]"
+
+    @property
+    def has_flight(self) -> bool:
+        return any(flight.ticks for flight in self.flights.values())
+
+
 @app.command()
 def replay(
     logs: Annotated[
@@ -32,80 +47,70 @@ def replay(
     bundle: Annotated[
         Path | None, typer.Option(help="The policy's bundle; where the robot had it, if not given.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run policy and flight decisions again on flight logs; say what differs."""
-    from edge.drivers.flight_log import Missing
-
-    metadata = _metadata(logs)
-    paths, missing = list(metadata), list[Missing]()
-    policy_bundle: Bundle | None = None
-    comparisons: tuple[Comparison, ...] = ()
     with working("running the logs again"):
-        flights = _flights(metadata, missing)
-        flown = any(flight.ticks for flight in flights.values())
-        if _has_policy_ticks(paths):
-            policy_bundle, comparisons = _policy(metadata, bundle)
-        elif not flown:
-            raise ValueError(f"{', '.join(map(str, logs))}: no policy ticks: the policy never ran")
-    for gap in missing:
+        of = _run_again(logs, bundle)
+    for gap in of.missing:
         typer.echo(f"lpac: {gap}", err=True)
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    "bundle": policy_bundle and policy_bundle.id,
-                    "robots": sorted({each.robot_id for each in metadata.values()}),
-                    "logs": [str(path) for path in paths],
-                    "outputs": {c.name: _output(c) for c in comparisons},
-                    "missing": [{**gap._asdict(), "path": str(gap.path)} for gap in missing],
-                    "flights": [
-                        _flight(path, metadata[path], flight) for path, flight in flights.items()
-                    ],
-                },
-                indent=2,
-            )
-        )
+        typer.echo(json.dumps(_described(of), indent=2))
     else:
-        for c in comparisons:
+        for c in of.comparisons:
             typer.echo(
                 f"{c.name:12} {c.ticks:7,} ticks, {c.differing:,} differ, "
                 f"largest difference {c.largest_difference:g}"
             )
-        _print_flights(flights, metadata)
-    problems = _problems(comparisons, flights, missing)
+        _print_flights(of.flights, of.metadata)
+    problems = _problems(of)
     if problems:
         raise ValueError("; ".join(problems))
-    if not as_json and policy_bundle is not None:
+    if not as_json:
+        _print_well(of)
+
+
+def _run_again(logs: list[Path], bundle: Path | None) -> _RunAgain:
+    from edge.drivers.flight_log import Missing
+
+    metadata = _metadata(logs)
+    missing = list[Missing]()
+    of = _RunAgain(metadata, None, (), _flights(metadata, missing), missing)
+    if _has_policy_ticks(metadata):
+        policy_bundle, comparisons = _policy(metadata, bundle)
+        return of._replace(bundle=policy_bundle, comparisons=comparisons)
+    if not of.has_flight:
+        raise ValueError(f"{', '.join(map(str, logs))}: no policy ticks: the policy never ran")
+    return of
+
+
+def _print_well(of: _RunAgain) -> None:
+    """That nothing differs."""
+    if of.bundle is not None:
         found = "computes what it computed in flight"
-        if not comparisons:
+        if not of.comparisons:
             found = "is not run again: only policies of the family lpac are"
-        typer.echo(f"{policy_bundle.manifest.name} {policy_bundle.id[:12]}: {found}")
-    if not as_json and flown:
-        passed = sum(flight.passed_over for flight in flights.values())
+        typer.echo(f"{of.bundle.manifest.name} {of.bundle.id[:12]}: {found}")
+    if of.has_flight:
+        passed = sum(flight.passed_over for flight in of.flights.values())
         but = f", but for {passed:,} ticks that were passed over" if passed else ""
         typer.echo(f"flight: decides what it decided in flight{but}")
 
 
-def _problems(
-    comparisons: "Iterable[Comparison]",
-    flights: "Mapping[Path, FlightReplay]",
-    missing: "Iterable[Missing]",
-) -> list[str]:
+def _problems(of: _RunAgain) -> list[str]:
     """Why it is not said that all is as it was in flight."""
     problems = []
-    differing = [c for c in comparisons if c.differing]
+    differing = [c for c in of.comparisons if c.differing]
     if differing:
         offs = ", ".join(f"{c.name} by up to {c.largest_difference:g}" for c in differing)
         problems.append(f"not what was computed in flight: {offs}: {_ROUNDS}")
-    if any(flight.differing for flight in flights.values()):
-        ticks = sum(flight.differing for flight in flights.values())
-        rounds = all(d.differing.is_rounding for f in flights.values() for d in f.differences)
+    if ticks := sum(flight.differing for flight in of.flights.values()):
+        rounds = all(d.differing.is_rounding for f in of.flights.values() for d in f.differences)
         problems.append(
             f"not what was decided in flight: {ticks:,} ticks differ"
             + (f" in the last digits alone: {_ROUNDS}" if rounds else "")
         )
-    damaged = sorted({gap.path.name for gap in missing if gap.damaged})
+    damaged = sorted({gap.path.name for gap in of.missing if gap.damaged})
     if damaged:
         problems.append(f"not all could be run again: {', '.join(damaged)}: damaged")
     return problems
@@ -227,11 +232,21 @@ def _print_flights(
         )
 
 
-def _output(comparison: "Comparison") -> dict[str, Any]:
+def _described(of: _RunAgain) -> dict[str, Any]:
     return {
-        "ticks": comparison.ticks,
-        "differing": comparison.differing,
-        "largest_difference": _or_none(comparison.largest_difference),
+        "bundle": of.bundle and of.bundle.id,
+        "robots": sorted({each.robot_id for each in of.metadata.values()}),
+        "logs": [str(path) for path in of.metadata],
+        "outputs": {
+            c.name: {
+                "ticks": c.ticks,
+                "differing": c.differing,
+                "largest_difference": _or_none(c.largest_difference),
+            }
+            for c in of.comparisons
+        },
+        "missing": [{**gap._asdict(), "path": str(gap.path)} for gap in of.missing],
+        "flights": [_flight(path, of.metadata[path], its) for path, its in of.flights.items()],
     }
 
 

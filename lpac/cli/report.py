@@ -1,6 +1,7 @@
 """`lpac record` and `lpac report`: what happened, kept and shown."""
 
 import json
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
@@ -8,55 +9,56 @@ from typing import Annotated
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.fields import options_of
 from lpac.cli.printing import progress_of_run
 
 app = new_app()
 
 
-@app.command()
-def report(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportOptions:
+    """What it is about, and where it goes."""
+
     folders: Annotated[
         list[Path],
         typer.Argument(metavar="DIR...", help="Where the robots' and the ground's logs are."),
-    ],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder to write to; else `report` in the first DIR.")
-    ] = None,
+    ]
+    out: Annotated[Path | None, "Folder to write to; else `report` in the first DIR."] = None
     trial: Annotated[
-        list[str] | None,
-        typer.Option(help="Only the mission of this name; may be repeated. Else all."),
-    ] = None,
+        list[str] | None, "Only the mission of this name; may be repeated. Else all."
+    ] = None
     times: Annotated[
-        str | None,
-        typer.Option(help="When to take snapshots, s from the mission's start, such as 0,20,60."),
-    ] = None,
-    world: Annotated[
-        Path | None, typer.Option(help="The world file, if it is not beside the logs.")
-    ] = None,
+        str | None, "When to take snapshots, s from the mission's start, such as 0,20,60."
+    ] = None
+    world: Annotated[Path | None, "The world file, if it is not beside the logs."] = None
     bundle: Annotated[
-        Path | None,
-        typer.Option(help="The policy's bundle; where the robots had it, if not given."),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
-) -> None:
+        Path | None, "The policy's bundle; where the robots had it, if not given."
+    ] = None
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False
+
+
+@app.command()
+@options_of(ReportOptions)
+def report(of: ReportOptions) -> None:
     """Make figures and an HTML page from flight logs; and how well missions repeat."""
     from lpac.analysis.examination import Wanted, examine
 
+    times_s = _times_s(of.times)
     wanted = Wanted(
-        missions=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle
+        missions=tuple(of.trial or ()), times_s=times_s, world=of.world, bundle=of.bundle
     )
     with progress_of_run() as show:
 
         def tell(what: str, share: float) -> None:
             show(share, what, ())
 
-        examined = examine(folders, wanted, tell)
+        examined = examine(of.folders, wanted, tell)
         # Only once there is something to draw: what draws takes a second to load.
         from lpac.analysis.write_report import write
 
-        page = write(examined, out or folders[0] / "report", wanted.times_s, tell)
+        page = write(examined, of.out or of.folders[0] / "report", times_s, tell)
     summary = examined.summary()
-    if as_json:
+    if of.as_json:
         typer.echo(json.dumps(summary, indent=2))
         return
     for values in summary["trials"]:

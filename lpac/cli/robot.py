@@ -4,13 +4,17 @@ import dataclasses
 import json
 import os
 import signal
+from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lpac.cli.apps import new_app
+
+if TYPE_CHECKING:
+    from edge.robot.setup import SetupReport
 
 app = new_app("robot", "Fly one robot, or check whether it could.")
 
@@ -25,6 +29,7 @@ class Rc(StrEnum):
 
 
 ConfigPath = Annotated[Path, typer.Option("--config", help="The robot's configuration, TOML.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @app.command()
@@ -61,7 +66,7 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
 def check(
     config: ConfigPath = Path("robot.toml"),
     wait: Annotated[float, typer.Option(help="How long the robot may take to be ready, s.")] = 15.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say which PX4 it is, what it would do when something fails, and what keeps it from flying.
 
@@ -73,20 +78,21 @@ def check(
 
     report = check_robot(load_config(config), wait)
     if as_json:
-        failed = [dataclasses.asdict(each) for each in report.failed]
-        typer.echo(json.dumps(report._asdict() | {"failed": failed}, indent=2))
+        checks = [dataclasses.asdict(each) for each in report.failed]
+        typer.echo(json.dumps(report._asdict() | {"failed": checks}, indent=2))
     else:
-        typer.echo(report.version)
-        for line in report.explanations:
+        for line in (report.version, *report.explanations):
             typer.echo(line)
-        for line in report.changes:
-            typer.echo(f"set: {line}")
-        for failed_check in report.failed:
-            typer.echo(f"FAILED  {failed_check.text}")
+        _print_changes(report.changes, [failed.text for failed in report.failed])
     if report.failed:
         count = len(report.failed)
         raise ValueError(f"not ready to fly: {counted(count, 'check')} failed")
     typer.echo("ready to fly", err=as_json)
+
+
+def _print_changes(changes: Iterable[str], problems: Iterable[str]) -> None:
+    for line in (*(f"set: {each}" for each in changes), *(f"FAILED  {each}" for each in problems)):
+        typer.echo(line)
 
 
 @app.command()
@@ -105,7 +111,7 @@ def setup(
         float, typer.Option(help="Time after which a hung program's vehicle holds, s.")
     ] = 0.5,
     wait: Annotated[float, typer.Option(help="How long to listen for the vehicle, s.")] = 10.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Set a vehicle's system id and failsafe parameters, once, also those that need a reboot.
 
@@ -123,13 +129,15 @@ def setup(
     show("error")
     with vehicle_lock(port_of(url)), MavsdkAutopilot(url) as autopilot:
         report = set_up(autopilot, autopilot, requirements, system_id, wait)
+    _tell_setup(report, as_json=as_json)
+
+
+def _tell_setup(report: "SetupReport", *, as_json: bool) -> None:
+    """Raises ValueError if there are problems."""
     if as_json:
         typer.echo(json.dumps(report._asdict(), indent=2))
     else:
-        for line in report.changes:
-            typer.echo(f"set: {line}")
-        for line in report.problems:
-            typer.echo(f"FAILED  {line}")
+        _print_changes(report.changes, report.problems)
     if report.problems:
         raise ValueError("the vehicle is not safe to fly as it is")
     if report.needs_reboot:

@@ -1,13 +1,24 @@
 """`lpac site`: save where a fleet flies, and fly there again."""
 
 import dataclasses
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.ground_requests import address, interruptible, looking, measure, print_json, show
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots
+from lpac.cli.fields import options_of
+from lpac.cli.ground_requests import (
+    Addressed,
+    ListenSeconds,
+    address,
+    interruptible,
+    looking,
+    measure,
+    print_json,
+    show,
+)
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots
 from lpac.cli.printing import BAD, print_table, styled
 
 if TYPE_CHECKING:
@@ -20,57 +31,60 @@ app = new_app(
 Name = Annotated[str, typer.Argument(metavar="NAME", help="The site's name.")]
 
 
-@app.command()
-def save(
-    name: Name,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteOptions:
+    """What is saved."""
+
+    name: Name
     from_robot: Annotated[
         str, typer.Option("--from", help="The origin is where this robot stands; else as it is.")
-    ] = "",
-    toward: Annotated[
-        str, typer.Option("--toward", help="The y axis points to this robot; with --from.")
-    ] = "",
-    land_at_pads: Annotated[
-        bool, typer.Option("--land-at-pads", help="Robots land where they stand now.")
-    ] = False,
-    seconds: Annotated[
-        float, typer.Option("--seconds", min=0.5, max=600, help="How long to listen.")
-    ] = 5.0,
-    force: Annotated[bool, typer.Option("--force", help="Replace a site of that name.")] = False,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+    ] = ""
+    toward: Annotated[str, "The y axis points to this robot; with --from."] = ""
+    land_at_pads: Annotated[bool, "Robots land where they stand now."] = False
+    seconds: ListenSeconds = 5.0
+    force: Annotated[bool, "Replace a site of that name."] = False
+
+
+@app.command()
+@options_of(SiteOptions, OfFleet)
+def save(site: SiteOptions, of: OfFleet) -> None:
     """Save origin, fence, and as pads where the robots of the slots stand now.
 
     Nothing is told to the robots: `lpac site use NAME` does that.
     """
-    from lpac.ground.site import Sites, site_as_it_stands
+    from lpac.ground.site import Sites
+
+    if site.toward and not site.from_robot:
+        raise ValueError("site save: --toward needs --from")
+    to = address(of.fleet, of.robots)
+    sites = Sites(to.path)
+    if not site.force:
+        sites.require_new(site.name)
+    saved = _as_it_stands(to, site)
+    path = sites.save(site.name, saved)
+    if of.as_json:
+        print_json({"site": site.name, "path": str(path), **dataclasses.asdict(saved)})
+    else:
+        _print_slots(saved)
+        typer.echo(f"\n{path}: `lpac site use {site.name}` takes it")
+
+
+def _as_it_stands(to: Addressed, site: SiteOptions) -> "SavedSite":
+    from lpac.ground.site import site_as_it_stands
     from lpac.ground.station.subscriber import addressed
 
-    if toward and not from_robot:
-        raise ValueError("site save: --toward needs --from")
-    to = address(fleet, robots)
-    sites = Sites(to.path)
-    if not force:
-        sites.require_new(name)
     with looking(to) as subscriber:
         names = addressed(subscriber.setup, to.robots)
-        measured = {*names, *filter(None, (from_robot, toward))}
-        stands = measure(subscriber, sorted(measured), seconds)
-        site = site_as_it_stands(
+        measured = {*names, *filter(None, (site.from_robot, site.toward))}
+        stands = measure(subscriber, sorted(measured), site.seconds)
+        return site_as_it_stands(
             subscriber.setup,
             subscriber.snapshot.ground,
             {robot: stands[robot] for robot in names},
-            stands.get(from_robot),
-            stands.get(toward),
-            land_at_pads=land_at_pads,
+            stands.get(site.from_robot),
+            stands.get(site.toward),
+            land_at_pads=site.land_at_pads,
         )
-    path = sites.save(name, site)
-    if as_json:
-        print_json({"site": name, "path": str(path), **_described(site)})
-    else:
-        _print_slots(site)
-        typer.echo(f"\n{path}: `lpac site use {name}` takes it")
 
 
 @app.command()
@@ -107,7 +121,7 @@ def list_(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
     used = sites.used()
     if as_json:
         described = {
-            name: {"used": name == used, "problem": None, **_described(site)}
+            name: {"used": name == used, "problem": None, **dataclasses.asdict(site)}
             for name, site in saved.items()
         } | {name: {"used": name == used, "problem": why} for name, why in problems.items()}
         print_json({"sites": described})
@@ -142,7 +156,3 @@ def _print_slots(site: "SavedSite") -> None:
         ],
         headings,
     )
-
-
-def _described(site: "SavedSite") -> dict[str, object]:
-    return dataclasses.asdict(site)

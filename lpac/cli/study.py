@@ -92,11 +92,9 @@ def fly_study(
         typer.echo(json.dumps(told, indent=2))
         return told
     show_report(report, folder)
-    if told["test_set_opened"] is not None:
-        typer.echo(
-            f"the test set was opened, {study.worlds} worlds of it: if you choose by this, it is "
-            "no test set any more"
-        )
+    if (opened := told["test_set_opened"]) is not None:
+        beside = "if you choose by this, it is no test set any more"
+        typer.echo(f"the test set was opened, {opened['worlds']} worlds of it: {beside}")
     return told
 
 

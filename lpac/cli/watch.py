@@ -42,17 +42,7 @@ def watch(
 
     name = load_fleet(fleet).fleet
     if screenshot is not None:
-        from lpac.ground.terminal.app import Watch
-
-        columns_and_lines = re.fullmatch(r"([1-9]\d{1,3})x([1-9]\d{1,3})", size)
-        if columns_and_lines is None:
-            raise ValueError(f"--size {size}: must be columns x lines, such as 100x30")
-        across, down = map(int, columns_and_lines.groups())
-        with screenshot.open("w") as file:
-            # There is a ground process, or this ends here.
-            _look(name)
-            app = Watch(name, screenshot=True)
-            file.write(app.run(headless=True, size=(across, down)) or "")
+        _save_screenshot(name, screenshot, size)
     elif as_json:
         _, snapshot = _look(name)
         typer.echo(json.dumps(dataclasses.asdict(snapshot)))
@@ -68,6 +58,20 @@ def watch(
 
         # Without the mouse the terminal's own way to mark and copy text works.
         Watch(name).run(mouse=False)
+
+
+def _save_screenshot(fleet: str, path: Path, size: str) -> None:
+    from lpac.ground.terminal.app import Watch
+
+    columns_and_lines = re.fullmatch(r"([1-9]\d{1,3})x([1-9]\d{1,3})", size)
+    if columns_and_lines is None:
+        raise ValueError(f"--size {size}: must be columns x lines, such as 100x30")
+    across, down = map(int, columns_and_lines.groups())
+    with path.open("w") as file:
+        # There is a ground process, or this ends here.
+        _look(fleet)
+        app = Watch(fleet, screenshot=True)
+        file.write(app.run(headless=True, size=(across, down)) or "")
 
 
 def _look(fleet: str) -> tuple["FleetSetup", "FleetSnapshot"]:

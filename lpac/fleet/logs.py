@@ -1,8 +1,14 @@
 """The robots' journals: what the program, and systemd about it, wrote and when."""
 
 import json
+import shlex
+from collections.abc import Callable
 from datetime import datetime
 from typing import NamedTuple
+
+from lpac.fleet.execute import execute
+from lpac.fleet.session import RemoteError, as_root
+from lpac.fleet.settings import FleetConfig, RobotHost
 
 
 class Entry(NamedTuple):
@@ -19,6 +25,25 @@ def journal_command(lines: int, *, follow: bool) -> list[str]:
         "--unit", "lpac-land.service",
         "--lines", str(lines), "--output", "json", *(["--follow"] if follow else []),
     ]  # fmt: skip
+
+
+async def read_journal(
+    config: FleetConfig,
+    robot: RobotHost,
+    lines: int,
+    on_entry: Callable[[Entry, str], None],
+    *,
+    follow: bool,
+) -> None:
+    """Hand each entry, and the robot's name, to `on_entry`. Raises RemoteError."""
+    complaints: list[str] = []
+    command = as_root(shlex.join(journal_command(lines, follow=follow)))
+
+    def on_output(line: str) -> None:
+        on_entry(parse_entry(line), robot.name)
+
+    if await execute(config, robot, command, on_output, complaints.append) != 0:
+        raise RemoteError(complaints[-1] if complaints else "journalctl failed")
 
 
 def parse_entry(line: str) -> Entry:

@@ -141,6 +141,8 @@ IMPURE = {
     "asyncio", "io", "logging", "multiprocessing", "os", "pathlib", "random", "shutil", "signal",
     "socket", "subprocess", "tempfile", "threading", "time",
 }  # fmt: skip
+# Files of the CLI whose functions may be longer.
+_LONG = {"drill.py"}
 
 
 def part_of(module: str) -> str:
@@ -199,6 +201,23 @@ def test_cli_imports_its_parts_only_when_a_command_runs() -> None:
         if part_of(module) not in ("lpac", "lpac.cli", "lpac.shipped")
         and module.split(".")[0] in loads
     ] == []
+
+
+def test_functions_of_the_cli_are_short() -> None:
+    """At most 40 lines, and 8 parameters; an option that is shared is a dataclass's field."""
+    long = []
+    for path in sources():
+        if not path.is_relative_to(ROOT / "lpac" / "cli") or path.name in _LONG:
+            continue
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or node.lineno) - node.lineno + 1
+                of = node.args
+                parameters = len([*of.posonlyargs, *of.args, *of.kwonlyargs])
+                if lines > 40 or parameters > 8:
+                    where = f"{path.relative_to(ROOT)}: {node.name}"
+                    long.append(f"{where}: {lines} lines, {parameters} parameters")
+    assert not long, "\n".join(long)
 
 
 def test_log_lines_have_their_details_by_name() -> None:

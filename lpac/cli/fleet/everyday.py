@@ -270,9 +270,7 @@ def logs(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")] = False,
 ) -> None:
     """Show what the robots' programs, and systemd about them, have written, by time."""
-    from lpac.fleet.execute import execute
-    from lpac.fleet.logs import Entry, journal_command, parse_entry, readable
-    from lpac.fleet.session import RemoteError, as_root
+    from lpac.fleet.logs import Entry, read_journal, readable
 
     config, chosen = open_fleet(fleet, robots)
     label = _labels(chosen)
@@ -285,18 +283,11 @@ def logs(
             for line in readable(entry).split("\n"):
                 typer.echo(label[name] + line)
 
-    async def one(robot: "RobotHost") -> None:
-        def on_output(line: str) -> None:
-            entry = parse_entry(line)
-            if follow:
-                show(entry, robot.name)
-            else:
-                entries.append((entry, robot.name))
+    def keep(entry: Entry, name: str) -> None:
+        entries.append((entry, name))
 
-        complaints: list[str] = []
-        command = as_root(shlex.join(journal_command(lines, follow=follow)))
-        if await execute(config, robot, command, on_output, complaints.append) != 0:
-            raise RemoteError(complaints[-1] if complaints else "journalctl failed")
+    async def one(robot: "RobotHost") -> None:
+        await read_journal(config, robot, lines, show if follow else keep, follow=follow)
 
     outcomes = _run_plainly(chosen, one, label)
     for entry, name in sorted(entries):
@@ -340,15 +331,15 @@ def execute_on_all(
             typer.echo(f"{label[robot.name]}exit code {exit_code}", err=True)
         return {"exit_code": exit_code, **written}
 
-    outcomes = [
-        o._replace(problem=f"exit code {o.value['exit_code']}")
-        if o.value is not None and o.value["exit_code"] != 0
-        else o
-        for o in _run_plainly(chosen, one, label)
-    ]
+    outcomes = [_by_exit_code(outcome) for outcome in _run_plainly(chosen, one, label)]
     if as_json:
         print_json(config, outcomes, lambda value: value)
     require_all(outcomes, "succeeded on")
+
+
+def _by_exit_code(outcome: "Outcome[dict[str, Any]]") -> "Outcome[dict[str, Any]]":
+    code = 0 if outcome.value is None else outcome.value["exit_code"]
+    return outcome._replace(problem=f"exit code {code}") if code else outcome
 
 
 def _run_plainly(

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lpac.cli.fields import options_of
 from lpac.cli.fleet.progress import print_json, print_problems, require_all, run_for_each
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots, open_fleet
 from lpac.cli.printing import BAD, FAINT, GOOD, NOTABLE, print_notes, print_table, styled
 
 if TYPE_CHECKING:
@@ -47,9 +48,7 @@ def doctor(
     if as_json:
         _echo(config, _described(diagnoses))
     else:
-        _print_board(diagnoses)
-        _print_findings(diagnoses)
-        _print_free_ground(config)
+        _print_found(config, diagnoses)
     _require_none_failed(diagnoses)
 
 
@@ -61,6 +60,14 @@ def _examine(config: "FleetConfig", robots: Sequence["RobotHost"]) -> "list[Outc
         return await examine(config, robot, others, report)
 
     return run_for_each(robots, one)
+
+
+def _print_found(config: "FleetConfig", diagnoses: "Sequence[Diagnosis]") -> None:
+    _print_board(diagnoses)
+    _print_findings(diagnoses)
+    margin = config.free_ground()
+    if margin is not None:
+        typer.echo(f"\nkeep free: the fence and {margin.least_m:g} m around it ({margin.why})")
 
 
 def _print_board(diagnoses: "Sequence[Diagnosis]") -> None:
@@ -99,13 +106,7 @@ def _print_findings(diagnoses: "Sequence[Diagnosis]") -> None:
     print_notes(notes)
 
 
-def _print_free_ground(config: "FleetConfig") -> None:
-    margin = config.free_ground()
-    if margin is not None:
-        typer.echo(f"\nkeep free: the fence and {margin.least_m:g} m around it ({margin.why})")
-
-
-def _print_group(config: "FleetConfig") -> None:
+def _print_multicast(config: "FleetConfig") -> None:
     """What multicast costs."""
     from lpac.fleet.up import group_costs
 
@@ -143,62 +144,80 @@ def _require_none_failed(diagnoses: "Sequence[Diagnosis]") -> None:
 # up
 
 
+@options_of(OfFleet)
 def up(
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
+    of: OfFleet,
+    *,
     timeout: Annotated[float, typer.Option(help="How long robots are waited for, s.")] = 40.0,
     trial: Annotated[
         float, typer.Option(min=1.0, help="A trial's duration, s: how many is a pack good for?")
     ] = 60.0,
-    as_json: AsJson = False,
 ) -> None:
     """Wait for the robots, set their clocks, start their programs, look at all: go or no-go.
 
     Without --robots for all that have a slot. Nothing takes off.
     """
-    from lpac.fleet.cards import has_group_keys, open_authority
-    from lpac.fleet.up import board, bring_up, decide, packs
+    from lpac.fleet.up import board, decide, packs
 
-    config, chosen = open_fleet(fleet, robots)
-    if robots is None:
-        chosen = [robot for robot in chosen if config.slot_of(robot.name) is not None]
-        if not chosen:
-            raise ValueError(f"{config.path}: slots: no robot sits in one")
+    config, chosen = open_fleet(of.fleet, of.robots)
     until_s = time.monotonic() + timeout
-    # Who is not given a new key is not understood by who was.
-    if robots is None and has_group_keys(config) and open_authority(config).renew_group_key():
-        typer.echo("the group has a new key, since a key of the fleet was revoked")
-
-    async def arrive(robot: "RobotHost", report: "Report") -> "Arrival":
-        return await bring_up(config, robot, until_s, report)
-
-    arrivals = run_for_each(chosen, arrive)
+    if of.robots is None:
+        chosen = _in_slots(config, chosen)
+        _renew_group_key(config)
+    arrivals = _arrivals(config, chosen, until_s)
     came = [outcome.robot for outcome in arrivals if outcome.value is not None]
     examinations = _examine(config, came)
     diagnoses = board(config, arrivals, examinations)
     batteries = {pack.robot: pack for pack in packs(config, examinations, trial)}
     decisions = [decide(diagnosis) for diagnosis in diagnoses]
-    if as_json:
+    if of.as_json:
         described = _described(diagnoses)
         for decision in decisions:
             described[decision.robot] |= {"go": decision.go, "reasons": decision.reasons}
-            if (pack := batteries.get(decision.robot)) is not None:
-                described[decision.robot]["pack"] = pack._asdict()
+        for pack in batteries.values():
+            described[pack.robot]["pack"] = pack._asdict()
         _echo(config, described)
     else:
-        _print_board(diagnoses)
-        _print_findings(diagnoses)
-        _print_free_ground(config)
-        _print_group(config)
+        _print_found(config, diagnoses)
+        _print_multicast(config)
         _print_decisions(decisions, batteries)
-        if config.insecure:
-            typer.secho("insecure: whoever is on the network can fly this fleet", fg="yellow")
-        typer.echo(
-            f"trials: how many of {trial:g} s each pack lasts for; --trial SECONDS for others"
-        )
+        _print_remarks(config, trial)
     no_go = [decision.robot for decision in decisions if not decision.go]
     if no_go:
         raise ValueError(f"NO-GO: {', '.join(no_go)}")
+
+
+def _in_slots(config: "FleetConfig", robots: Sequence["RobotHost"]) -> list["RobotHost"]:
+    """Raises ValueError if none is."""
+    chosen = [robot for robot in robots if config.slot_of(robot.name) is not None]
+    if not chosen:
+        raise ValueError(f"{config.path}: slots: no robot sits in one")
+    return chosen
+
+
+def _print_remarks(config: "FleetConfig", trial_s: float) -> None:
+    if config.insecure:
+        typer.secho("insecure: whoever is on the network can fly this fleet", fg="yellow")
+    typer.echo(f"trials: how many of {trial_s:g} s each pack lasts for; --trial SECONDS for others")
+
+
+def _renew_group_key(config: "FleetConfig") -> None:
+    """With all robots only: one that is not given the new key does not understand the others."""
+    from lpac.fleet.cards import has_group_keys, open_authority
+
+    if has_group_keys(config) and open_authority(config).renew_group_key():
+        typer.echo("the group has a new key, since a key of the fleet was revoked")
+
+
+def _arrivals(
+    config: "FleetConfig", robots: Sequence["RobotHost"], until_s: float
+) -> "list[Outcome[Arrival]]":
+    from lpac.fleet.up import bring_up
+
+    async def arrive(robot: "RobotHost", report: "Report") -> "Arrival":
+        return await bring_up(config, robot, until_s, report)
+
+    return run_for_each(robots, arrive)
 
 
 def _print_decisions(decisions: "Sequence[GoDecision]", batteries: "Mapping[str, Pack]") -> None:

@@ -2,14 +2,17 @@
 
 import asyncio
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.fleet.progress import print_json, print_problems, require_all, run_for_each
+from lpac.cli.fields import flag_of, options_of
+from lpac.cli.fleet.everyday import print_outcomes
+from lpac.cli.fleet.progress import print_json, require_all, run_for_each
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
-from lpac.cli.printing import GOOD, print_table, styled
+from lpac.cli.printing import GOOD, styled
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -17,38 +20,39 @@ if TYPE_CHECKING:
     from lpac.fleet.hold import Report
     from lpac.fleet.pull import Pulled
     from lpac.fleet.settings import RobotHost
+    from lpac.fleet.swap import Swapped
 
 _STEP_WIDTH = 14
 
 
-def enroll(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnrolOptions:
+    """Which computer, and what it becomes."""
+
     name: Annotated[
         str | None,
         typer.Argument(help="The robot's name in the fleet, such as r11; else all of the file."),
-    ] = None,
+    ] = None
     host: Annotated[
         str | None,
         typer.Argument(
             help="Its address, or its name in ssh's configuration; not needed if the file has it."
         ),
-    ] = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    user: Annotated[
-        str | None, typer.Option(help="Who logs in: root (the default), or a user with sudo.")
-    ] = None,
-    port: Annotated[int | None, typer.Option(help="Its ssh port, if not ssh's own.")] = None,
+    ] = None
+    fleet: Fleet = DEFAULT_FLEET
+    user: Annotated[str | None, "Who logs in: root (the default), or a user with sudo."] = None
+    port: Annotated[int | None, "Its ssh port, if not ssh's own."] = None
     address: Annotated[
-        str | None,
-        typer.Option(help="Its IPv4 address for the other robots, if HOST's is not that."),
-    ] = None,
+        str | None, "Its IPv4 address for the other robots, if HOST's is not that."
+    ] = None
     robot_id: Annotated[
-        int | None,
-        typer.Option(help="Its id in the fleet; by default, if new, the number in its name."),
-    ] = None,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="Even if it is enrolled as another robot.")
-    ] = False,
-) -> None:
+        int | None, "Its id in the fleet; by default, if new, the number in its name."
+    ] = None
+    yes: Annotated[bool, "Even if it is enrolled as another robot."] = False
+
+
+@options_of(EnrolOptions)
+def enroll(of: EnrolOptions) -> None:
     """Make a computer with a vehicle a robot of the fleet; may be repeated at any time.
 
     It gets a key, a place in the fleet's file as a spare, an id and a card; voxl-vision-hub is set,
@@ -57,28 +61,22 @@ def enroll(
     """
     from lpac.fleet.settings import load_fleet
 
-    options = {"host": host, "--user": user, "--port": port, "--address": address,
-               "--robot-id": robot_id}  # fmt: skip
-    given = [option for option, value in options.items() if value is not None]
-    if name is None and given:
-        raise ValueError(f"{given[0]} is one robot's: give its name too")
-    names = list(load_fleet(fleet).robots) if name is None else [name]
+    if of.name is None:
+        for option in ("host", "user", "port", "address", "robot_id"):
+            if getattr(of, option) is not None:
+                flag = option if option == "host" else flag_of(option)
+                raise ValueError(f"{flag} is one robot's: give its name too")
+    names = list(load_fleet(of.fleet).robots) if of.name is None else [of.name]
     if not names:
-        raise ValueError(f"{fleet}: has no robots yet: give a name and an address")
-    left = {}
-    for each in names:
+        raise ValueError(f"{of.fleet}: has no robots yet: give a name and an address")
+    left = []
+    for name in names:
         if len(names) > 1:
-            typer.echo(f"{each}:")
-        left[each] = _enroll(
-            fleet, each, host, user=user, port=port, address=address, robot_id=robot_id, rename=yes
-        )
-    problems = [
-        f"{each} is not ready: left to do: {', '.join(steps)}"
-        for each, steps in left.items()
-        if steps
-    ]
-    if problems:
-        raise ValueError("; ".join(problems))
+            typer.echo(f"{name}:")
+        if steps := _enroll(name, of):
+            left.append(f"{name} is not ready: left to do: {', '.join(steps)}")
+    if left:
+        raise ValueError("; ".join(left))
     are = "is" if len(names) == 1 else "are"
     typer.echo(
         f"{', '.join(names)} {are} enrolled; `lpac fleet doctor --robots {','.join(names)}` looks "
@@ -86,17 +84,7 @@ def enroll(
     )
 
 
-def _enroll(
-    fleet: Path,
-    name: str,
-    host: str | None,
-    *,
-    user: str | None,
-    port: int | None,
-    address: str | None,
-    robot_id: int | None,
-    rename: bool,
-) -> list[str]:
+def _enroll(name: str, of: EnrolOptions) -> list[str]:
     """Print each step; those that are left to do."""
     from lpac.fleet.enroll import EnrolStep
     from lpac.fleet.enroll import enroll as enroll_robot
@@ -113,8 +101,8 @@ def _enroll(
 
     asyncio.run(
         enroll_robot(
-            fleet, name, host, user=user, port=port, address=address, robot_id=robot_id,
-            rename=rename, operator=user_at_host, on_step=on_step, say=_say,
+            of.fleet, name, of.host, user=of.user, port=of.port, address=of.address,
+            robot_id=of.robot_id, rename=of.yes, operator=user_at_host, on_step=on_step, say=_say,
         )
     )  # fmt: skip
     return left
@@ -129,7 +117,6 @@ def swap(
 
     The failed robot is stopped if it answers; one in flight refuses.
     """
-    from lpac.fleet.settings import load_fleet
     from lpac.fleet.swap import swap as swap_robots
 
     def report(step: str, share: float | None) -> None:
@@ -137,6 +124,12 @@ def swap(
 
     swapped = asyncio.run(swap_robots(fleet, failed, spare, report, user_at_host))
     _say("")
+    _print_swapped(fleet, failed, spare, swapped)
+
+
+def _print_swapped(fleet: Path, failed: str, spare: str, swapped: "Swapped") -> None:
+    from lpac.fleet.settings import load_fleet
+
     slot = load_fleet(fleet).slots[swapped.slot]
     deployed = swapped.deployed
     if not swapped.changed:
@@ -195,19 +188,14 @@ def pull(
     if as_json:
         print_json(config, outcomes, lambda pulled: pulled._asdict())
     else:
-        rows: list[list[str | Text]] = [
-            [o.robot.name, "", "", "", ""]
-            if o.value is None
-            else [
-                o.robot.name, str(o.value.files), f"{o.value.size_bytes / 1e6:.1f}",
-                f"{o.value.sent_bytes / 1e6:.1f}", styled(o.value.summary, GOOD),
-            ]
-            for o in outcomes
-        ]  # fmt: skip
-        headings = ("robot", "files", "MB", "MB sent", "result")
-        print_table(headings, rows, headings[1:4])
-        print_problems(outcomes)
+        numbers = ("files", "MB", "MB sent")
+        print_outcomes(outcomes, (*numbers, "result"), _pulled_cells, numbers)
     require_all(outcomes, "pulled from")
+
+
+def _pulled_cells(value: "Pulled") -> tuple["str | Text", ...]:
+    sizes = (f"{size / 1e6:.1f}" for size in (value.size_bytes, value.sent_bytes))
+    return str(value.files), *sizes, styled(value.summary, GOOD)
 
 
 def _say(text: str) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -35,6 +35,16 @@ _LOOK_S = 0.2
 _NOT_TOLD = "not told by the radio"
 
 
+class _Heard(NamedTuple):
+    """What was measured, and what it means."""
+
+    checked: "Checked"
+    pairs: "Sequence[Pair]"
+    verdict: "RadioVerdict"
+    stream: "BulkStream | None"
+    asked: "Sequence[Outcome[list[Interface]]]"
+
+
 def radio(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
@@ -57,14 +67,47 @@ def radio(
     Needs `lpac ground`, and robots with a mission origin; nothing is asked of them. Spares
     are left out. With --robots these alone are judged, on the air that all robots share.
     """
+    config, chosen = open_fleet(fleet, robots)
+    heard = _measured(config, chosen, seconds, load=load)
+    checked, told = heard.checked, heard.verdict
+    if record is not None:
+        _write(record, heard)
+    if out is not None:
+        from lpac.radio.heat_map import draw
+
+        draw(checked.robots, heard.pairs, f"{config.fleet}: {told.sentence}", out / "radio")
+    if as_json:
+        typer.echo(json.dumps({"fleet": config.fleet, **_described(heard)}, indent=2))
+    else:
+        _print_pairs(checked, heard.pairs)
+        _print_wifi(checked, heard.asked)
+        _print_verdict(heard)
+    if told.problems:
+        raise ValueError(f"radio: {told.sentence}")
+
+
+def _write(record: Path, heard: _Heard) -> None:
+    from lpac.radio.records import write_records
+
+    write_records(record, heard.checked.records(heard.pairs))
+    if not heard.asked:
+        note = "these robots are simulated on this computer: what is recorded is of no radio"
+        typer.echo(f"note: {note}", err=True)
+
+
+# Measuring
+
+
+def _measured(
+    config: "FleetConfig", robots: Sequence["RobotHost"], seconds: float, *, load: bool
+) -> _Heard:
+    """Listen to those that have a slot. Raises ValueError."""
     from edge.policy.bundle import load_bundle
     from lpac.ground.station.subscriber import GroundSubscriber
     from lpac.radio.airtime import MESSAGE_BYTES
-    from lpac.radio.records import write_records
     from lpac.radio.verdict import verdict
 
-    config, chosen = open_fleet(fleet, robots)
-    chosen = [robot for robot in chosen if config.slot_of(robot.name) is not None]
+    chosen = [robot for robot in robots if config.slot_of(robot.name) is not None]
     if len(chosen) < 2:
         raise ValueError("radio: two robots or more with a slot are needed to hear each other")
     computers = [robot for robot in chosen if robot.has_computer]
@@ -78,26 +121,8 @@ def radio(
         windows, stream = _listen(ground, config, seconds, computers[0] if load else None)
         after = _read_wifi(config, computers)
     checked = _checked(config, chosen, windows, before, after, MESSAGE_BYTES[payload], loaded=load)
-    found = checked.pairs()
-    told = verdict(checked, found)
-    if record is not None:
-        write_records(record, checked.records(found))
-        if not computers:
-            note = "these robots are simulated on this computer: what is recorded is of no radio"
-            typer.echo(f"note: {note}", err=True)
-    if out is not None:
-        from lpac.radio.heat_map import draw
-
-        draw(checked.robots, found, f"{config.fleet}: {told.sentence}", out / "radio")
-    if as_json:
-        typer.echo(json.dumps(_described(config, checked, found, told, stream, after), indent=2))
-    else:
-        _print(checked, found, told, stream, after)
-    if told.problems:
-        raise ValueError(f"radio: {told.sentence}")
-
-
-# Measuring
+    pairs = checked.pairs()
+    return _Heard(checked, pairs, verdict(checked, pairs), stream, after)
 
 
 def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load: bool) -> None:
@@ -214,13 +239,8 @@ def _checked(
 # Telling
 
 
-def _print(
-    checked: "Checked",
-    found: Sequence["Pair"],
-    told: "RadioVerdict",
-    stream: "BulkStream | None",
-    asked: "Sequence[Outcome[list[Interface]]]",
-) -> None:
+def _print_pairs(checked: "Checked", found: Sequence["Pair"]) -> None:
+    """Tables of who hears whom."""
     from lpac.radio.pairs import LATE_S
 
     names = checked.robots
@@ -240,14 +260,21 @@ def _print(
         ]  # fmt: skip
         print_table(("", *names), rows, names)
         typer.echo()
+
+
+def _print_wifi(checked: "Checked", asked: "Sequence[Outcome[list[Interface]]]") -> None:
     if asked:
-        print_table(
-            ("robot", "signal dBm", "rate Mbit/s", "channel busy %"),
-            [[name, *_wifi_cells(checked.wifi.get(name))] for name in names],
-            ("signal dBm", "rate Mbit/s", "channel busy %"),
-        )
+        numbers = ("signal dBm", "rate Mbit/s", "channel busy %")
+        rows: list[list[str | Text]] = [
+            [name, *_wifi_cells(checked.wifi.get(name))] for name in checked.robots
+        ]
+        print_table(("robot", *numbers), rows, numbers)
         print_problems(asked)
         typer.echo()
+
+
+def _print_verdict(heard: _Heard) -> None:
+    told, stream = heard.verdict, heard.stream
     if stream is not None:
         typer.echo(f"bulk stream from {stream.robot}: {stream.rate_mbit_s:.1f} Mbit/s")
     for problem in told.problems:
@@ -256,7 +283,7 @@ def _print(
         typer.secho(told.sentence, fg=GOOD)
     # A failure needs none, unless it is the model that finds the channel too small.
     if told.room is not None and (not told.problems or told.room.carries < told.room.robots):
-        typer.secho(_basis(checked, told.room), dim=True)
+        typer.secho(_basis(heard.checked, told.room), dim=True)
 
 
 def _basis(checked: "Checked", room: "Room") -> str:
@@ -330,17 +357,10 @@ def _wifi_cells(wifi: "WifiReading | None") -> list["Text"]:
     return [styled(_NOT_TOLD, FAINT) if v is None else styled(f"{v:.0f}", "") for v in values]
 
 
-def _described(
-    config: "FleetConfig",
-    checked: "Checked",
-    found: Sequence["Pair"],
-    told: "RadioVerdict",
-    stream: "BulkStream | None",
-    asked: "Sequence[Outcome[list[Interface]]]",
-) -> dict[str, Any]:
-    problems = {outcome.robot.name: outcome.problem for outcome in asked}
+def _described(heard: _Heard) -> dict[str, Any]:
+    checked, told, stream = heard.checked, heard.verdict, heard.stream
+    problems = {outcome.robot.name: outcome.problem for outcome in heard.asked}
     return {
-        "fleet": config.fleet,
         "ok": not told.problems,
         "sentence": told.sentence,
         "problems": told.problems,
@@ -357,6 +377,6 @@ def _described(
         },
         "pairs": [
             {**pair._asdict(), "delivered": pair.delivered, "late_share": pair.late_share}
-            for pair in found
+            for pair in heard.pairs
         ],
     }

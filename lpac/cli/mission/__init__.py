@@ -2,14 +2,17 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.fields import options_of
 from lpac.cli.ground_requests import (
     Addressed,
+    ListenSeconds,
     address,
     ask,
     confirm,
@@ -19,9 +22,10 @@ from lpac.cli.ground_requests import (
 )
 from lpac.cli.mission.rehearse import rehearse
 from lpac.cli.mission.run import run
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet
 
 if TYPE_CHECKING:
+    from edge.messages.mission import Origin
     from lpac.ground.site import Point, Standing
     from lpac.ground.station.protocol import Request
 
@@ -31,79 +35,116 @@ app = new_app(
 # Negative numbers are no options.
 _NUMBERS = {"ignore_unknown_options": True}
 
-# The state's origin, fence and world are the whole fleet's.
-WaitFor = Annotated[
-    str | None,
-    typer.Option("--robots", help="Sent to all; only these must accept it, such as r1,r3."),
-]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Until all have landed.")]
-Names = Annotated[
-    list[str] | None, typer.Argument(metavar="[ROBOT...]", help="The robots; else all.")
-]
-OnlyNames = Annotated[
-    list[str] | None, typer.Argument(metavar="ROBOT...", help="The robots; never all.")
-]
-OnlyRobots = Annotated[str | None, typer.Option("--robots", help="The same, such as r1,r3.")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OfAll(OfFleet):
+    """Options of a command for all: the state's origin, fence and world are the whole fleet's."""
+
+    robots: Annotated[
+        str | None,
+        typer.Option("--robots", help="Sent to all; only these must accept it, such as r1,r3."),
+    ] = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Named(OfFleet):
+    """Options of a command for robots by name or by --robots; else for all."""
+
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[ROBOT...]", help="The robots; else all.")
+    ] = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnlyNamed(Named):
+    """The same of a command that is never meant for all."""
+
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="ROBOT...", help="The robots; never all.")
+    ] = None
+    robots: Annotated[str | None, typer.Option("--robots", help="The same, such as r1,r3.")] = None
+
+
+def _named(of: Named) -> Addressed:
+    """Whom a command addresses that takes robots' names as well as --robots."""
+    if of.names and of.robots is not None:
+        raise ValueError("give the robots' names or --robots, not both")
+    return address(of.fleet, ",".join(of.names) if of.names else of.robots)
 
 
 # Where
 
 
-@app.command(context_settings=_NUMBERS)
-def origin(
-    latitude: Annotated[float | None, typer.Argument(metavar="LAT", help="Degrees.")] = None,
-    longitude: Annotated[float | None, typer.Argument(metavar="LON", help="Degrees.")] = None,
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OriginOptions:
+    """Where the mission frame lies."""
+
+    latitude: Annotated[float | None, typer.Argument(metavar="LAT", help="Degrees.")] = None
+    longitude: Annotated[float | None, typer.Argument(metavar="LON", help="Degrees.")] = None
     heading: Annotated[
         float | None,
         typer.Argument(metavar="HEADING_DEG", help="Of the y axis, from true north, [0, 360)."),
-    ] = None,
+    ] = None
     from_robot: Annotated[
         str, typer.Option("--from", help="Where this robot stands, and y where its nose points.")
-    ] = "",
-    toward: Annotated[
-        str, typer.Option("--toward", help="The y axis points to this robot; with --from.")
-    ] = "",
+    ] = ""
+    toward: Annotated[str, "The y axis points to this robot; with --from."] = ""
     seconds: Annotated[
         float, typer.Option("--seconds", min=0.5, max=600, help="How long --from listens.")
-    ] = 5.0,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: WaitFor = None,
-    as_json: AsJson = False,
-) -> None:
+    ] = 5.0
+
+
+@app.command(context_settings=_NUMBERS)
+@options_of(OriginOptions, OfAll)
+def origin(given: OriginOptions, of: OfAll) -> None:
     """Set where the mission frame lies: LAT LON HEADING_DEG, or as a robot stands (--from)."""
-    from edge.messages.mission import Origin
-    from lpac.ground.site import FAR_M, furthest_m, origin_at
     from lpac.ground.station.protocol import SetOrigin
 
-    to = address(fleet, robots)
-    if from_robot:
-        if latitude is not None:
-            raise ValueError("origin: give LAT LON HEADING_DEG, or --from ROBOT, not both")
-        with looking(to) as subscriber:
-            stands = measure(subscriber, [from_robot, *filter(None, [toward])], seconds)
-        first, second = stands[from_robot], stands.get(toward)
-        where = origin_at(first, second)
-        typer.echo(_measured(first, second), err=True)
-    elif latitude is None or longitude is None or heading is None or toward:
-        raise ValueError(
-            "origin: give LAT LON HEADING_DEG, or --from ROBOT, with or without --toward ROBOT"
-        )
-    else:
-        try:
-            where = Origin(latitude, longitude, heading)
-        except ValueError as error:
-            raise ValueError(f"origin: {error}") from None
-        with looking(to) as subscriber:
-            far_m = furthest_m(where, subscriber.snapshot)
-        if far_m > FAR_M:
-            typer.echo(f"NOTE: robots are up to {far_m / 1e3:.1f} km from this origin", err=True)
+    to = address(of.fleet, of.robots)
+    where = _measured_origin(to, given) if given.from_robot else _given_origin(to, given)
     typer.echo(
         f"origin: {where.latitude_deg:.7f} {where.longitude_deg:.7f}, y axis {where.heading_deg:g} "
         "deg from north",
         err=True,
     )
-    ask(to, SetOrigin(where, to.robots), "origin", as_json=as_json)
+    ask(to, SetOrigin(where, to.robots), "origin", as_json=of.as_json)
+
+
+def _measured_origin(to: Addressed, given: OriginOptions) -> "Origin":
+    from lpac.ground.site import origin_at
+
+    if given.latitude is not None:
+        raise ValueError("origin: give LAT LON HEADING_DEG, or --from ROBOT, not both")
+    with looking(to) as subscriber:
+        robots = [given.from_robot, *filter(None, [given.toward])]
+        stands = measure(subscriber, robots, given.seconds)
+    first, second = stands[given.from_robot], stands.get(given.toward)
+    where = origin_at(first, second)
+    typer.echo(_measured(first, second), err=True)
+    return where
+
+
+def _given_origin(to: Addressed, given: OriginOptions) -> "Origin":
+    """Says so if it is far from the robots."""
+    from edge.messages.mission import Origin
+    from lpac.ground.site import FAR_M, furthest_m
+
+    if given.latitude is None or given.longitude is None or given.heading is None or given.toward:
+        raise ValueError(
+            "origin: give LAT LON HEADING_DEG, or --from ROBOT, with or without --toward ROBOT"
+        )
+    try:
+        where = Origin(given.latitude, given.longitude, given.heading)
+    except ValueError as error:
+        raise ValueError(f"origin: {error}") from None
+    with looking(to) as subscriber:
+        far_m = furthest_m(where, subscriber.snapshot)
+    if far_m > FAR_M:
+        typer.echo(f"NOTE: robots are up to {far_m / 1e3:.1f} km from this origin", err=True)
+    return where
 
 
 def _measured(first: "Standing", second: "Standing | None") -> str:
@@ -125,23 +166,23 @@ app.add_typer(fence)
 
 
 @fence.command("on")
-def fence_on(fleet: Fleet = DEFAULT_FLEET, robots: WaitFor = None, as_json: AsJson = False) -> None:
+@options_of(OfAll)
+def fence_on(of: OfAll) -> None:
     """Each robot's configured fence again."""
     from lpac.ground.station.protocol import SetFence
 
-    to = address(fleet, robots)
-    ask(to, SetFence(None, to.robots), "fence on", as_json=as_json)
+    to = address(of.fleet, of.robots)
+    ask(to, SetFence(None, to.robots), "fence on", as_json=of.as_json)
 
 
 @fence.command("off")
-def fence_off(
-    yes: Yes = False, fleet: Fleet = DEFAULT_FLEET, robots: WaitFor = None, as_json: AsJson = False
-) -> None:
+@options_of(OfAll)
+def fence_off(of: OfAll, *, yes: Yes = False) -> None:
     """A square of 200 m around the origin only: nothing keeps the robots near. Asks first."""
     from lpac.ground.site import WIDE_FENCE_M, wide_fence
     from lpac.ground.station.protocol import SetFence
 
-    to = address(fleet, robots)
+    to = address(of.fleet, of.robots)
     confirm(
         f"Let all robots of fleet {to.fleet} fly {WIDE_FENCE_M / 2:g} m far from the origin?",
         "fence off",
@@ -149,11 +190,14 @@ def fence_off(
     )
     with looking(to) as subscriber:
         wide = wide_fence(subscriber.setup.fence)
-    ask(to, SetFence(wide, to.robots), "fence off", as_json=as_json)
+    ask(to, SetFence(wide, to.robots), "fence off", as_json=of.as_json)
 
 
 @fence.command("set", context_settings=_NUMBERS)
+@options_of(OfAll)
 def fence_set(
+    of: OfAll,
+    *,
     corners: Annotated[
         list[str], typer.Argument(metavar="X,Y...", help="Corners in the mission frame, m.")
     ],
@@ -162,15 +206,12 @@ def fence_set(
     ] = None,
     floor: Annotated[float | None, typer.Option("--floor", help="Lowest height, m.")] = None,
     ceiling: Annotated[float | None, typer.Option("--ceiling", help="Greatest height, m.")] = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: WaitFor = None,
-    as_json: AsJson = False,
 ) -> None:
     """A convex polygon, such as 0,0 32,0 32,32 0,32; the rest as configured unless given."""
     from edge.core.fence import Fence as Polygon
     from lpac.ground.station.protocol import SetFence
 
-    to = address(fleet, robots)
+    to = address(of.fleet, of.robots)
     points = tuple(_point(corner) for corner in corners)
     with looking(to) as subscriber:
         configured = subscriber.setup.fence
@@ -183,7 +224,7 @@ def fence_set(
         )
     except ValueError as error:
         raise ValueError(f"fence set: {error}") from None
-    ask(to, SetFence(polygon, to.robots), "fence set", as_json=as_json)
+    ask(to, SetFence(polygon, to.robots), "fence set", as_json=of.as_json)
 
 
 def _point(text: str) -> "Point":
@@ -195,34 +236,32 @@ def _point(text: str) -> "Point":
 
 
 @app.command()
+@options_of(OfAll)
 def world(
+    of: OfAll,
+    *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A CoverageControl world file.")],
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: WaitFor = None,
-    as_json: AsJson = False,
 ) -> None:
     """Send a world to the robots' virtual sensors. Refused in flight."""
     from edge.messages.mission import world_id
     from lpac.ground.script import read_world
     from lpac.ground.station.protocol import SetWorld
 
-    to = address(fleet, robots)
+    to = address(of.fleet, of.robots)
     text = read_world(file)
     typer.echo(f"world: {file.name}, {world_id(text)}", err=True)
-    ask(to, SetWorld(text, file.name, to.robots), "world", as_json=as_json)
+    ask(to, SetWorld(text, file.name, to.robots), "world", as_json=of.as_json)
 
 
 @app.command()
+@options_of(OfFleet)
 def assign(
+    of: OfFleet,
+    *,
     site: Annotated[
         str, typer.Option("--site", help="Its pads; else those of the site in use.")
     ] = "",
-    seconds: Annotated[
-        float, typer.Option("--seconds", min=0.5, max=600, help="How long to listen.")
-    ] = 2.0,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
+    seconds: ListenSeconds = 2.0,
 ) -> None:
     """Give each robot the slot (height, landing point) of the pad where it stands, by GPS.
 
@@ -234,7 +273,7 @@ def assign(
     from lpac.ground.station.protocol import SetPlaces
     from lpac.ground.station.subscriber import addressed
 
-    to = address(fleet, robots)
+    to = address(of.fleet, of.robots)
     with looking(to) as subscriber:
         setup, ground = subscriber.setup, subscriber.snapshot.ground
         names = addressed(setup, to.robots)
@@ -250,52 +289,31 @@ def assign(
         name: {"pad": on_pad.height, "m": round(on_pad.distance_m, 2)}
         for name, on_pad in assigned.items()
     }
-    ask(to, SetPlaces(places), "assign", as_json=as_json, details=details)
+    ask(to, SetPlaces(places), "assign", as_json=of.as_json, details=details)
 
 
 # Flying
 
 
-def _of_robots(request: Callable[[Addressed], "Request"]) -> None:
-    """Add the command of this name, for robots by name or by --robots; else for all."""
-    name = request.__name__
+def _command_of(
+    options: type[Named],
+) -> Callable[[Callable[[Addressed], "Request"]], None]:
+    """Decorate what makes a request: adds the command of this name."""
 
-    def command(
-        names: Names = None,
-        fleet: Fleet = DEFAULT_FLEET,
-        robots: Robots = None,
-        as_json: AsJson = False,
-    ) -> None:
-        to = _named(names, fleet, robots)
-        ask(to, request(to), name, as_json=as_json)
+    def add(request: Callable[[Addressed], "Request"]) -> None:
+        name = request.__name__
 
-    app.command(name, help=request.__doc__)(command)
+        @options_of(options)
+        def command(of: Named) -> None:
+            to = _named(of)
+            ask(to, request(to), name, as_json=of.as_json)
 
+        app.command(name, help=request.__doc__)(command)
 
-def _of_named_robots(request: Callable[[Addressed], "Request"]) -> None:
-    """The same for a command that is never meant for all."""
-    name = request.__name__
-
-    def command(
-        names: OnlyNames = None,
-        fleet: Fleet = DEFAULT_FLEET,
-        robots: OnlyRobots = None,
-        as_json: AsJson = False,
-    ) -> None:
-        to = _named(names, fleet, robots)
-        ask(to, request(to), name, as_json=as_json)
-
-    app.command(name, help=request.__doc__)(command)
+    return add
 
 
-def _named(names: list[str] | None, fleet: Path, robots: str | None) -> Addressed:
-    """Whom a command addresses that takes robots' names as well as --robots."""
-    if names and robots is not None:
-        raise ValueError("give the robots' names or --robots, not both")
-    return address(fleet, ",".join(names) if names else robots)
-
-
-@_of_robots
+@_command_of(Named)
 def enable(to: Addressed) -> "Request":
     """Let the robots run their checks, and fly."""
     from lpac.ground.station.protocol import Enable
@@ -303,7 +321,7 @@ def enable(to: Addressed) -> "Request":
     return Enable(True, to.robots)
 
 
-@_of_robots
+@_command_of(Named)
 def disable(to: Addressed) -> "Request":
     """Let the robots fly no more: those in the air hold."""
     from lpac.ground.station.protocol import Enable
@@ -312,8 +330,10 @@ def disable(to: Addressed) -> "Request":
 
 
 @app.command()
+@options_of(Named)
 def takeoff(
-    names: Names = None,
+    of: Named,
+    *,
     interval: Annotated[
         float, typer.Option("--interval", min=0, max=60, help="Between two robots, s.")
     ] = 2.0,
@@ -321,9 +341,6 @@ def takeoff(
         bool, typer.Option("--abort-on-failure", help="Nobody else takes off once one has failed.")
     ] = False,
     yes: Yes = False,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
 ) -> None:
     """Take off, the highest first; done when all hold at their heights.
 
@@ -331,15 +348,17 @@ def takeoff(
     """
     from lpac.ground.station.protocol import Takeoff
 
-    to = _named(names, fleet, robots)
+    to = _named(of)
     who = ", ".join(to.robots) or f"all robots of fleet {to.fleet}"
     confirm(
-        f"Start the motors of {who}, and take off?", "takeoff", yes=yes or not sys.stdin.isatty()
+        f"Start the motors of {who}, and take off?",
+        "takeoff",
+        yes=yes or not sys.stdin.isatty(),
     )
-    ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=as_json)
+    ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=of.as_json)
 
 
-@_of_robots
+@_command_of(Named)
 def start(to: Addressed) -> "Request":
     """Fly the mission, from hold."""
     from lpac.ground.station.protocol import Start
@@ -347,7 +366,7 @@ def start(to: Addressed) -> "Request":
     return Start(to.robots)
 
 
-@_of_robots
+@_command_of(Named)
 def hold(to: Addressed) -> "Request":
     """Stay where they are. Anybody may command it."""
     from lpac.ground.station.protocol import SafetyCommand
@@ -355,7 +374,7 @@ def hold(to: Addressed) -> "Request":
     return SafetyCommand("hold", to.robots)
 
 
-@_of_robots
+@_command_of(Named)
 def resume(to: Addressed) -> "Request":
     """Withdraw hold, return or land; robots that flew the mission fly it again."""
     from lpac.ground.station.protocol import Resume
@@ -364,53 +383,43 @@ def resume(to: Addressed) -> "Request":
 
 
 @app.command()
-def land(
-    names: Names = None,
-    wait: Wait = False,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@options_of(Named)
+def land(of: Named, *, wait: Wait = False) -> None:
     """Land where they are."""
-    _bring_down("land", _named(names, fleet, robots), wait=wait, as_json=as_json)
+    _bring_down("land", of, wait=wait)
 
 
 @app.command("return")
-def return_(
-    names: Names = None,
-    wait: Wait = False,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@options_of(Named)
+def return_(of: Named, *, wait: Wait = False) -> None:
     """Fly to the landing points at their own heights, and land there, the lowest first."""
-    _bring_down("return", _named(names, fleet, robots), wait=wait, as_json=as_json)
+    _bring_down("return", of, wait=wait)
 
 
-def _bring_down(
-    safety_action: Literal["return", "land"], to: Addressed, *, wait: bool, as_json: bool
-) -> None:
+def _bring_down(safety_action: Literal["return", "land"], of: Named, *, wait: bool) -> None:
     from lpac.ground.station.protocol import SafetyCommand
 
-    ask(to, SafetyCommand(safety_action, to.robots, wait), safety_action, as_json=as_json)
+    to = _named(of)
+    request = SafetyCommand(safety_action, to.robots, wait)
+    ask(to, request, safety_action, as_json=of.as_json)
 
 
 # One robot at a time
 
 
-@_of_named_robots
+@_command_of(OnlyNamed)
 def pilot(to: Addressed) -> "Request":
     """Hand robots to human pilots, by name: the program commands nothing until `rejoin`."""
     return _give("pilot", to)
 
 
-@_of_named_robots
+@_command_of(OnlyNamed)
 def rejoin(to: Addressed) -> "Request":
     """Take robots back from their pilots, by name: they hold; then `start`."""
     return _give("rejoin", to)
 
 
-@_of_robots
+@_command_of(Named)
 def disarm(to: Addressed) -> "Request":
     """Stop the motors on the ground. A robot in the air refuses."""
     from lpac.ground.station.protocol import RobotCommand
@@ -423,18 +432,13 @@ def disarm(to: Addressed) -> "Request":
 
 
 @app.command()
-def kill(
-    names: OnlyNames = None,
-    yes: Yes = False,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: OnlyRobots = None,
-    as_json: AsJson = False,
-) -> None:
+@options_of(OnlyNamed)
+def kill(of: OnlyNamed, *, yes: Yes = False) -> None:
     """Stop the motors at once, also in the air: THE ROBOTS FALL. Asks first."""
-    to = _named(names, fleet, robots)
+    to = _named(of)
     request = _give("kill", to)
     confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
-    ask(to, request, "kill", as_json=as_json)
+    ask(to, request, "kill", as_json=of.as_json)
 
 
 def _give(kind: Literal["pilot", "rejoin", "kill"], to: Addressed) -> "Request":
@@ -452,19 +456,19 @@ def _give(kind: Literal["pilot", "rejoin", "kill"], to: Addressed) -> "Request":
 
 
 @app.command()
+@options_of(OfFleet)
 def again(
+    of: OfFleet,
+    *,
     trial: Annotated[
         str, typer.Argument(metavar="[TRIAL]", help="Its name; else the next number.")
     ] = "",
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
 ) -> None:
     """Begin the next trial: explored maps and mailboxes are forgotten."""
     from lpac.ground.station.protocol import NextTrial
 
-    to = address(fleet, robots)
-    ask(to, NextTrial(trial, to.robots), "again", as_json=as_json)
+    to = address(of.fleet, of.robots)
+    ask(to, NextTrial(trial, to.robots), "again", as_json=of.as_json)
 
 
 @app.command()

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console, Group
     from rich.live import Live
 
+    from lpac.ground.script import ScriptRun
     from lpac.ground.station.subscriber import GroundSubscriber
 
 
@@ -44,46 +45,55 @@ def run(
 
     If a step fails, and at Ctrl-C, the fleet is told to hold. Before each further trial it asks.
     """
-    from lpac.ground.script import ScriptError, ScriptRun, load_script
+    from lpac.ground.script import ScriptRun, load_script
     from lpac.ground.site import Sites
-    from lpac.ground.station.client import GroundError
 
     to = address(fleet, None)
     sites = Sites(to.path)
     loaded = load_script(script, sites)
-    if loaded.trials > 1 and not yes and not sys.stdin.isatty():
-        raise ValueError(
-            f"{script}: trials = {loaded.trials}: asks before the next trial takes off, and there "
-            "is no terminal: add --yes"
-        )
+    if loaded.trials > 1 and not yes:
+        _require_terminal(f"{script}: trials = {loaded.trials}")
     # A terminal that is closed ends a script as Ctrl-C does.
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     with looking(to) as subscriber:
         view = _View(subscriber, yes, as_json)
-        flight = ScriptRun(loaded, sites, subscriber, view)
-        view.robots = flight.robots
-        try:
-            with view.shown():
-                subscriber.carry_out(flight.fly())
-                view.end_step()
-        except ScriptError as error:
-            then = f"; {subscriber.carry_out(flight.hold())}" if error.hold else ""
-            problem, code = f"{error}{then}", 1
-        except GroundError as error:
-            problem, code = f"{error}; robots in the air hold by themselves, and then land", 1
-        except (KeyboardInterrupt, typer.Abort, OSError, SystemExit) as error:
-            # A question is aborted. A terminal that is gone cannot be written to; rich exits when
-            # its pipe breaks.
-            why = str(error) if isinstance(error, OSError) else "interrupted"
-            problem, code = f"{why}; {subscriber.carry_out(flight.hold())}", 130
-        else:
-            problem, code = "", 0
+        problem, code = _fly(ScriptRun(loaded, sites, subscriber, view), view)
     typer.echo(f"lpac: {script}: {problem}" if problem else f"{script}: done", err=True)
     if as_json:
         outcome = {"script": str(script), "done": not problem, "problem": problem or None}
         typer.echo(json.dumps(outcome))
     raise typer.Exit(code)
+
+
+def _require_terminal(which: str) -> None:
+    if not sys.stdin.isatty():
+        raise ValueError(
+            f"{which}: asks before the next trial takes off, and there is no terminal: add --yes"
+        )
+
+
+def _fly(flight: "ScriptRun", view: "_View") -> tuple[str, int]:
+    """The problem, if there was one, and the exit code."""
+    from lpac.ground.script import ScriptError
+    from lpac.ground.station.client import GroundError
+
+    view.robots, carry_out = flight.robots, view.subscriber.carry_out
+    try:
+        with view.shown():
+            carry_out(flight.fly())
+            view.end_step()
+    except ScriptError as error:
+        then = f"; {carry_out(flight.hold())}" if error.hold else ""
+        return f"{error}{then}", 1
+    except GroundError as error:
+        return f"{error}; robots in the air hold by themselves, and then land", 1
+    except (KeyboardInterrupt, typer.Abort, OSError, SystemExit) as error:
+        # A question is aborted. A terminal that is gone cannot be written to; rich exits when its
+        # pipe breaks.
+        why = str(error) if isinstance(error, OSError) else "interrupted"
+        return f"{why}; {carry_out(flight.hold())}", 130
+    return "", 0
 
 
 @dataclass(slots=True)
