@@ -1,7 +1,6 @@
 """What is in flight logs: a record of each mission, and what a reader should know of these."""
 
 import contextlib
-import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -9,11 +8,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from edge.core.counted import counted
+from edge.core.fence import Fence
+from edge.core.schema import from_mapping
+from edge.drivers.flight_log import FlightMetadata
 from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import Bundle, BundleError, load_bundle
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, Separation
-from lpac.analysis.logs import Logs, Progress, configured_fence, read_logs
+from lpac.analysis.logs import Logs, Progress, configured, read_logs
 from lpac.analysis.missions import Mission, find_missions, record_of
 
 _MOST_NOTES = 3  # in one line
@@ -81,7 +83,7 @@ def examine(
     chosen = _choose(logs, missions, wanted)
     notes = list(logs.notes)
     worlds = _Worlds(logs, paths, wanted, notes)
-    fences = {m.robot_id: configured_fence(m) for m in logs.metadata}
+    fences = {m.robot_id: _fence(m) for m in logs.metadata}
     records = []
     for index, mission in enumerate(chosen):
         progress(f"examining {mission.name}", index / len(chosen))
@@ -126,7 +128,7 @@ class _Worlds:
         self._given = None if wanted.world is None else wanted.world.read_text("utf-8-sig")
         self._texts = {setup.world_id: setup.world for _, setup in logs.setups if setup.world}
         paths = [path for folder in folders for path in sorted(folder.rglob("*.env"))]
-        paths += [Path(_policy(m.configuration).get("world", "")) for m in logs.metadata]
+        paths += [Path(configured(m, "policy").get("world", "")) for m in logs.metadata]
         for path in dict.fromkeys(paths):
             # Not every .env file is a world.
             with contextlib.suppress(OSError, UnicodeDecodeError):
@@ -186,7 +188,7 @@ class _Worlds:
         places = []
         for metadata in self._logs.metadata:
             if metadata.bundle_id in bundle_ids:
-                env_scale = float(_policy(metadata.configuration).get("env_scale", env_scale))
+                env_scale = float(configured(metadata, "policy").get("env_scale", env_scale))
                 places.append(Path(metadata.bundle_path))
         if self._bundle is not None:
             return _world_of(self._bundle, load_bundle(self._bundle), env_scale)
@@ -214,12 +216,12 @@ def _world_of(place: Path, bundle: Bundle, env_scale: float) -> _World:
     )  # fmt: skip
 
 
-def _policy(configuration: str) -> dict[str, Any]:
+def _fence(metadata: FlightMetadata) -> Fence | None:
+    """The configured one; None if that cannot be read."""
     try:
-        policy = json.loads(configuration)["policy"]
-    except (ValueError, KeyError, TypeError):
-        return {}
-    return policy if isinstance(policy, dict) else {}
+        return from_mapping(Fence, configured(metadata, "fence"), "fence")
+    except ValueError:
+        return None
 
 
 def _notes(logs: Logs, record: FlightRecord, wanted: Wanted) -> Iterable[str]:

@@ -433,21 +433,13 @@ class _LogReader:
             self._logs.received[robot_id] = Received(*ordered)
 
 
-def configured_fence(metadata: FlightMetadata) -> Fence | None:
-    """The fence of the robot's configuration; None if that cannot be read."""
+def configured(metadata: FlightMetadata, part: str) -> Mapping[str, Any]:
+    """A part of the robot's configuration; empty if that cannot be read."""
     try:
-        return from_mapping(Fence, json.loads(metadata.configuration)["fence"], "fence")
+        found = json.loads(metadata.configuration)[part]
     except (ValueError, KeyError, TypeError):
-        return None
-
-
-def configured_rates(metadata: FlightMetadata) -> LoopRates | None:
-    """The rates of the robot's configuration; None if they cannot be read."""
-    try:
-        rates = json.loads(metadata.configuration)["rates"]
-        return LoopRates(*(float(rates[name]) for name in LoopRates._fields))
-    except (ValueError, KeyError, TypeError):
-        return None
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _known(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:

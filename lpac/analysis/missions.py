@@ -3,6 +3,7 @@
 A mission of one name that is flown again after all were on the ground, or reset, is another.
 """
 
+import contextlib
 import heapq
 import itertools
 import math
@@ -31,7 +32,7 @@ from lpac.analysis.logs import (
     LoopRates,
     Program,
     Received,
-    configured_rates,
+    configured,
 )
 from lpac.analysis.mission_tracker import MissionTracker
 from lpac.analysis.truth import TrueTrack
@@ -154,8 +155,14 @@ def _record(
 
 def _rates(logs: Logs, programs: set[Program]) -> LoopRates | None:
     """Those of all of these programs; None if they differ, or one is not known."""
-    configured = {(m.robot_id, m.boot_nonce): configured_rates(m) for m in logs.metadata}
-    found = {configured.get(program) for program in programs}
+    known: dict[Program, LoopRates] = {}
+    for metadata in logs.metadata:
+        rates = configured(metadata, "rates")
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            known[metadata.robot_id, metadata.boot_nonce] = LoopRates(
+                *(float(rates[name]) for name in LoopRates._fields)
+            )
+    found = {known.get(program) for program in programs}
     return found.pop() if len(found) == 1 else None
 
 

@@ -1,16 +1,20 @@
-"""`lpac record` and `lpac report`: what happened, kept and shown."""
+"""`lpac report`: figures, a page and numbers of logged flights."""
 
 import json
+import math
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lpac.cli.apps import new_app
 from lpac.cli.fields import options_of
 from lpac.cli.printing import progress_of_run
+
+if TYPE_CHECKING:
+    from lpac.analysis.flight import FlightRecord
 
 app = new_app()
 
@@ -57,12 +61,11 @@ def report(of: ReportOptions) -> None:
         from lpac.analysis.write_report import write
 
         page = write(examined, of.out or of.folders[0] / "report", times_s, tell)
-    summary = examined.summary()
     if of.as_json:
-        typer.echo(json.dumps(summary, indent=2))
+        typer.echo(json.dumps(examined.summary(), indent=2))
         return
-    for values in summary["trials"]:
-        typer.echo(_line(values))
+    for record in examined.records:
+        typer.echo(_line(record))
     for note in examined.notes:
         typer.echo(f"note: {note}")
     typer.echo(f"see {page}")
@@ -77,29 +80,23 @@ def _times_s(times: str | None) -> tuple[float, ...]:
         raise ValueError(f"--times {times}: must be numbers such as 0,20,60") from None
 
 
-def _line(values: dict[str, object]) -> str:
+def _line(record: "FlightRecord") -> str:
     """A mission in one line."""
-
     from edge.core.counted import counted
 
-    cost, separation = values["cost"], values["separation"]
-    assert isinstance(cost, dict) and isinstance(values["robots"], list)
-    began_unix_s = values["began_unix_s"]
-    assert isinstance(began_unix_s, float)
     words = [
-        f"{values['trial']}: {datetime.fromtimestamp(began_unix_s):%Y-%m-%d %H:%M:%S}, "
-        f"{counted(len(values['robots']), 'robot')}, {values['duration_s']:.0f} s"
+        f"{record.name}: {datetime.fromtimestamp(record.begin_s):%Y-%m-%d %H:%M:%S}, "
+        f"{counted(len(record.robots), 'robot')}, {record.duration_s:.0f} s"
     ]
-    if cost["normalized"] is not None:
-        words.append(f"cost {cost['normalized']:.2f} of the initial")
-    if cost["normalized_lloyd"] is not None:
-        words.append(f"Lloyd's algorithm, knowing the world, {cost['normalized_lloyd']:.2f}")
-    if isinstance(separation, dict):
-        words.append(f"least distance {separation['distance_m']:.2f} m")
-    if isinstance(values["messages"], dict) and values["messages"]["loss_share"] is not None:
-        words.append(f"{100.0 * values['messages']['loss_share']:.1f} % of the messages lost")
-    for name in ("alarm", "restart"):
-        found = values[f"{name}s"]
-        if isinstance(found, list | dict) and found:
+    if len(record.normalized):
+        words.append(f"cost {record.normalized[-1]:.2f} of the initial")
+    if math.isfinite(record.normalized_lloyd):
+        words.append(f"Lloyd's algorithm, knowing the world, {record.normalized_lloyd:.2f}")
+    if record.separation is not None:
+        words.append(f"least distance {record.separation.distance_m:.2f} m")
+    if record.messages is not None and math.isfinite(record.messages.loss_share):
+        words.append(f"{100.0 * record.messages.loss_share:.1f} % of the messages lost")
+    for name, found in (("alarm", record.alarms), ("restart", record.restarts)):
+        if found:
             words.append(counted(len(found), name))
     return ", ".join(words)
