@@ -32,6 +32,7 @@ from lpac.cli.printing import print_table
 from lpac.cli.study import show_report, telling
 
 if TYPE_CHECKING:
+    from lpac.study.drill_report import Outcomes
     from lpac.study.drills import Drill
 
 app = new_app()
@@ -122,13 +123,11 @@ def fly_faults(
     again: bool = False,
 ) -> None:
     """Fly a drill, write its report and print it; a single flight `again` leaves its logs, too."""
-    from lpac.study.drill_report import as_junit, report_of
     from lpac.study.drills import fly_drill, logs_of, outcomes_of
-    from lpac.study.provenance import made_by
 
     require_here(VehicleKind(drill.engine), ray)
-    folder = out or _OUT
-    if drill.engine != "simulated":
+    folder, in_real_time = out or _OUT, drill.engine != "simulated"
+    if in_real_time:
         folder = out or Path(f"{_OUT}-{drill.engine}")
         # Whoever ends this command ends its programs, too.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -140,15 +139,27 @@ def fly_faults(
     else:
         with folder_lock("the drill", folder), telling("flights") as tell:
             outcomes = fly_drill(flights, folder, cores, tell)
-    report = report_of(outcomes, made_by(shlex.join(sys.argv[1:]), [flights[0].flown_by]))
+    _tell(outcomes, folder, as_json=as_json)
+    if again or in_real_time:
+        said = "logs and figures are there, too; `lpac report FOLDER` has more of a mission"
+        typer.echo(said, err=True)
+    if not all(outcome.held for outcome in outcomes.values()):
+        raise typer.Exit(1)
+
+
+def _tell(outcomes: "Outcomes", folder: Path, *, as_json: bool) -> None:
+    """Write the report, and JUnit's XML, and print it."""
+    from lpac.study.drill_report import as_junit, report_of
+    from lpac.study.provenance import made_by
+
+    bundle_id = next(iter(outcomes)).flown_by
+    report = report_of(outcomes, made_by(shlex.join(sys.argv[1:]), [bundle_id]))
     told = report.write(folder)
     (folder / "drill.xml").write_bytes(as_junit(outcomes))
     if as_json:
         typer.echo(json.dumps(told, indent=2))
     else:
         show_report(report, folder)
-    if not all(outcome.held for outcome in outcomes.values()):
-        raise typer.Exit(1)
 
 
 def _list(names: Sequence[str]) -> None:

@@ -25,7 +25,7 @@ from lpac.sim.drill.simulated import SUPPORTED, SimulatedDrill
 from lpac.sim.scenario import WORLD_SENSOR
 from lpac.sim.sitl.build import require_build
 from lpac.study.file import read_toml
-from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight
+from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight, require_planned
 
 DrillEngine = Literal["simulated", "mavlink", "px4"]
 # What is done to a fleet by each.
@@ -155,8 +155,12 @@ def fly_drill(
 def outcomes_of(
     group: FlightGroup, folder: Path | None = None
 ) -> list[tuple[PlannedFlight, FlightOutcome]]:
-    """Fly a fault, in whatever process this is; logs and a figure stay in `logs_of(it, folder)`."""
+    """Fly a fault, in whatever process this is; logs and a figure stay in its part of `folder`.
+
+    Raises BundleError, and ValueError if another bundle is there now.
+    """
     [flight] = group
+    require_planned(flight)
     fault, scenario, bundle = FAULTS[flight.fault], flight.scenario, Path(flight.bundle)
     # Thousands of flights say more than anybody reads.
     show("error")

@@ -109,6 +109,12 @@ def groups_of(flights: Iterable[PlannedFlight]) -> list[FlightGroup]:
     return [*groups, *(tuple(waiting) for waiting in alike.values() if waiting)]
 
 
+def require_planned(flight: PlannedFlight) -> None:
+    """Raise ValueError if another bundle is at its path than when the flight was planned."""
+    if loaded_bundle(flight.bundle).id != flight.flown_by:
+        raise ValueError(f"{flight.bundle}: is another bundle by now, or on this machine")
+
+
 def records_of(
     group: FlightGroup, logs: Path | None = None
 ) -> list[tuple[PlannedFlight, FlightRecord]]:
@@ -117,8 +123,8 @@ def records_of(
     Raises BundleError, ValueError, OSError, and what `lpac sim` does of programs in real time.
     """
     first = group[0]
-    if first.scenario.controller == POLICY and loaded_bundle(first.bundle).id != first.flown_by:
-        raise ValueError(f"{first.bundle}: is another bundle by now, or on this machine")
+    if first.scenario.controller == POLICY:
+        require_planned(first)
     engine = engine_of(first.engine, Path(first.px4_build) if first.px4_build else None)
     kept = logs / f"flight-{first.key[:8]}" if logs and first.engine in IN_REAL_TIME else None
     flown = engine.fly([flight.scenario for flight in group], Path(first.bundle), kept)

@@ -146,6 +146,20 @@ def test_a_flight_again_is_that_flight_with_logs_and_figure(
     assert len(list(folder.glob("robots/*/logs/*.mcap"))) == DRILL.robots
 
 
+def test_a_file_of_faults_is_flown_as_a_study(
+    tmp_path: Path, flown: dict[PlannedFlight, FlightOutcome]
+) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text('faults = ["landed"]\nfirst_seed = 1\nrobots = 2\n')
+    result = called("study", file, "--out", tmp_path / "out", "--json")
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    [told] = json.loads(result.stdout)["faults"]
+    outcome = next(outcome for flight, outcome in flown.items() if flight.fault == "landed")
+    worst = {figure["name"]: figure["value"] for figure in told["worst"]}
+    assert worst == {figure.name: figure.value for figure in outcome.figures}
+    assert (tmp_path / "out" / "README.md").exists() and (tmp_path / "out" / "drill.xml").exists()
+
+
 def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
     for arguments, text in (
         (("--fault", "nothing"), "--fault nothing: there is none; `lpac drill --list` has all"),

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Generator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,7 +14,7 @@ from lpac.sim.drill.bounds import Figure
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.outcome import FlightOutcome
 from lpac.study.drill_report import as_junit, report_of
-from lpac.study.drills import Drill, flies, read_drill
+from lpac.study.drills import Drill, flies, outcomes_of, read_drill
 from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight
 from tests.conftest import ROOT, SHIPPED
 
@@ -59,6 +60,12 @@ def test_what_was_judged_is_kept_and_the_rest_flown_again(tmp_path: Path) -> Non
         told = dict(kept.fly(flights, in_this_process))
         assert told == {flight: outcome_of(flight) for flight in flights}
     assert flown == [0, 1, 2, 2]
+
+
+def test_another_bundle_is_not_taken_for_it() -> None:
+    [flight] = Drill(faults=("held",)).flights()
+    with pytest.raises(ValueError, match="is another bundle by now"):
+        outcomes_of((replace(flight, flown_by="0" * 64),))
 
 
 def test_flights_in_real_time_have_a_pool_of_their_own(tmp_path: Path) -> None:

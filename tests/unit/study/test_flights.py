@@ -143,6 +143,16 @@ def test_a_flight_is_the_same_wherever_its_bundle_and_px4_lie() -> None:
     assert len({flight.key, *(other.key for other in others)}) == 3
 
 
+def test_another_build_of_px4_flies_otherwise(tmp_path: Path) -> None:
+    builds = {"first": b"one", "copy": b"one", "second": b"two"}
+    keys = {}
+    for name, program in builds.items():
+        (tmp_path / name / "bin").mkdir(parents=True)
+        (tmp_path / name / "bin" / "px4").write_bytes(program)
+        keys[name] = replace(flight_of(), engine="px4", px4_build=str(tmp_path / name)).key
+    assert keys["first"] == keys["copy"] != keys["second"]
+
+
 def test_policies_fly_together_and_nothing_gets_lost() -> None:
     conditions = (Condition(), Condition(scenario=FIELD.scenario(loss=0.3)))
     methods = (OURS, *map(Method.of, BASELINES))
