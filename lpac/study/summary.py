@@ -179,14 +179,16 @@ def report_of(
     told = as_json(study, results, compared=compared)
     for section in sections:
         told |= section.told
+    # That of the rates has all conditions in it.
+    of_conditions = [] if "rates" in study.figures else tables_of(told)
     return Report(
         name=name,
         title=study.title or name,
         text=f"{study.text} {flown_as(study)}".strip(),
-        legend=LEGEND,
+        legend=LEGEND if of_conditions else "",
         told=told,
         rows=next((section.rows for section in sections), rows_of(told)),
-        tables=[table for its in sections for table in its.tables] + tables_of(told),
+        tables=[*(table for its in sections for table in its.tables), *of_conditions],
         figures=[picture for its in sections for picture in its.figures]
         + draw_conditions(results, folder, study.figures),
         flown=flown_as(study),
