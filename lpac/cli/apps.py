@@ -1,9 +1,11 @@
 """How every command and group of commands of `lpac` is made."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 _WHOLE_LINE = 1000
 

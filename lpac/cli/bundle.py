@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.apps import new_app
+from lpac.cli.apps import AsJson, new_app
 
 if TYPE_CHECKING:
     from edge.policy.bundle import Manifest
@@ -17,7 +17,6 @@ app = new_app("bundle", "Look at a policy bundle; verify or time it on this mach
 BundlePath = Annotated[
     Path, typer.Argument(metavar="BUNDLE", help="A bundle's directory or .zip archive.")
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @app.command()

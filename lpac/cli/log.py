@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from lpac.cli.apps import new_app
+from lpac.cli.apps import AsJson, new_app
 
 app = new_app("log", "What the robots' and the ground's logs hold.")
 
@@ -17,7 +17,7 @@ _Uptimes = dict[tuple[str, str, str], tuple[float, float]]
 @app.command()
 def trials(
     folder: Annotated[Path, typer.Argument(help="Folder of logs (*.mcap).")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say which trials were flown, and when.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lpac.cli import apps
 from lpac.shipped import SHIPPED_BUNDLE
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ Fleet = Annotated[
 Robots = Annotated[
     str | None, typer.Option("--robots", help="Only these robots, such as r1,r3; else all.")
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Px4 = Annotated[
     Path | None,
     typer.Option(help="px4: PX4's build folder, made by `make px4_sitl`."),
@@ -34,6 +34,7 @@ Ray = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Fly on a Ray cluster, such as auto or HOST:6379."),
 ]
+AsJson = apps.AsJson
 DEFAULT_FLEET = Path("fleet.toml")
 DEFAULT_BUNDLE = SHIPPED_BUNDLE
 DEFAULT_SENSOR = "world"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.apps import new_app
+from lpac.cli.apps import AsJson, new_app
 
 if TYPE_CHECKING:
     from edge.robot.setup import SetupReport
@@ -29,7 +29,6 @@ class Rc(StrEnum):
 
 
 ConfigPath = Annotated[Path, typer.Option("--config", help="The robot's configuration, TOML.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @app.command()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import typer
 
+from lpac.cli.fields import options_of
 from lpac.cli.fleet.progress import (
     print_json,
     print_problems,
@@ -20,7 +21,7 @@ from lpac.cli.fleet.progress import (
     run_for_each,
 )
 from lpac.cli.fleet.status import SHORT, flight, program
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots, open_fleet
 from lpac.cli.printing import BAD, GOOD, print_notes, print_table, styled, working
 
 if TYPE_CHECKING:
@@ -128,47 +129,28 @@ def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson =
     """Start the robots' programs, now and at every boot. Nothing takes off by that."""
     config, chosen = open_fleet(fleet, robots)
     chosen = _without_spares(config, chosen, "started")
-    outcomes = _control(config, chosen, "start", lambda _: {"directory": config.directory})
-    _print_controlled(config, outcomes, "started on", as_json)
+    _control(config, chosen, "start", "started on", as_json, directory=config.directory)
 
 
-def stop(
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    in_flight: InFlight = False,
-    as_json: AsJson = False,
-) -> None:
+@options_of(OfFleet)
+def stop(of: OfFleet, *, in_flight: InFlight = False) -> None:
     """Stop the robots' programs, which do not start at the next boot either.
 
     A robot in flight refuses.
     """
-    config, chosen = open_fleet(fleet, robots)
-    outcomes = _control(
-        config, chosen, "stop",
-        lambda robot: {
-            "mavlink_port": robot.mavlink_port, "in_flight": in_flight, "disable": True,
-        },
-    )  # fmt: skip
-    _print_controlled(config, outcomes, "stopped on", as_json)
+    config, chosen = open_fleet(of.fleet, of.robots)
+    _control(config, chosen, "stop", "stopped on", of.as_json, in_flight=in_flight, disable=True)
 
 
-def restart(
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    in_flight: InFlight = False,
-    as_json: AsJson = False,
-) -> None:
+@options_of(OfFleet)
+def restart(of: OfFleet, *, in_flight: InFlight = False) -> None:
     """Stop the robots' programs and start them again. A robot in flight refuses."""
-    config, chosen = open_fleet(fleet, robots)
+    config, chosen = open_fleet(of.fleet, of.robots)
     chosen = _without_spares(config, chosen, "restarted")
-    outcomes = _control(
-        config, chosen, "restart",
-        lambda robot: {
-            "directory": config.directory, "mavlink_port": robot.mavlink_port,
-            "in_flight": in_flight,
-        },
+    _control(
+        config, chosen, "restart", "restarted on", of.as_json,
+        directory=config.directory, in_flight=in_flight,
     )  # fmt: skip
-    _print_controlled(config, outcomes, "restarted on", as_json)
 
 
 def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
@@ -202,23 +184,24 @@ def _control(
     config: "FleetConfig",
     robots: Sequence["RobotHost"],
     function: str,
-    arguments: Callable[["RobotHost"], dict[str, Any]],
-) -> list["Outcome[_Controlled]"]:
-    """Call a function that changes the unit on all robots, and holds them for that."""
+    done: str,
+    as_json: bool,
+    **arguments: object,
+) -> None:
+    """Call a function that changes the unit on all robots, hold them for that, print it.
+
+    One that is told `in_flight` needs the vehicle's port too.
+    """
     from lpac.fleet.hold import hold
 
     async def one(robot: "RobotHost", report: "Report") -> _Controlled:
+        port = {"mavlink_port": robot.mavlink_port} if "in_flight" in arguments else {}
         async with hold(config, robot, report) as held:
             report(function, None)
-            service = await held.session.call(function, **arguments(robot))
+            service = await held.session.call(function, **arguments, **port)
             return _Controlled(held.found["current"], service, held.recovered)
 
-    return run_for_each(robots, one)
-
-
-def _print_controlled(
-    config: "FleetConfig", outcomes: list["Outcome[_Controlled]"], done: str, as_json: bool
-) -> None:
+    outcomes = run_for_each(robots, one)
     if as_json:
         print_json(config, outcomes, _Controlled._asdict)
     else:
