@@ -123,7 +123,7 @@ def test_killed_and_with_a_full_disk_it_loses_nothing_and_goes_on(
             time.sleep(0.02)
         killed.send_signal(signal.SIGKILL)
     # A flight of somebody else's study; and as if it was killed in the middle of a line.
-    other = {"flight": "other", "seed": 0, "time_s": [0.0] * 20_000, "cost": [], "lloyd": None}
+    other = {"flight": "other", "outcome": [[0.0] * 20_000, [], None]}
     before = [*kept.read_text().splitlines()[:1], json.dumps(other)]
     kept.write_text("\n".join([*before, '{"flight": "lpa']))
 
