@@ -78,9 +78,10 @@ def serve(programs: ProgramsOptions) -> None:
                     fleet.vehicles.require_running()
                     display.show_or_say("programs start", fleet.heard.statuses())
                 fleet.begin()
+                fleet_toml = programs.folder / fleet.fleet_toml.name
                 display.print(
                     f"{counted(len(fleet.robots), 'robot')} until Ctrl-C; in a second terminal:\n\n"
-                    f"  export LPAC_FLEET={shlex.quote(str(fleet.fleet_toml))}\n"
+                    f"  export LPAC_FLEET={shlex.quote(str(fleet_toml))}\n"
                     "  lpac ground\n"
                 )
                 try:

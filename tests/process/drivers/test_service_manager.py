@@ -67,7 +67,7 @@ def test_a_status_is_one_line_of_ascii_however_long_its_texts_are() -> None:
     worst = '"\\é\n\0' * 100
     check = FailedCheck(max(CheckCode, key=len), worst, settles_by_itself=False)
     status = RobotStatus(
-        robot_id=65535, boot_nonce=2**48, sequence=1, uptime_s=1.0, unix_time_s=1.0,
+        robot_id=65535, boot_nonce=2**48 - 1, sequence=1, uptime_s=1.0, unix_time_s=1.0,
         state=FlightState.PREFLIGHT, reason=reason(worst), ready=False, failed_checks=(check,) * 50,
         alarms=reasons(worst), obeyed_sequence=1, operator=worst, orders=(), bundle_id="b" * 64,
         world_id="w" * 12, trial=worst, origin=None, system_id=255, slot_height_m=4.0,

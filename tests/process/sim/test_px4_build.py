@@ -298,7 +298,7 @@ def test_a_log_tells_where_the_vehicle_really_was(tmp_path: Path) -> None:
 
 def test_more_instances_than_ports_are_refused(build: Path) -> None:
     line = error_line(lpac("sim", "--vehicle", "px4", "--px4", build, "-n", 11))
-    assert "--robots 11: must be from 1 to 10 with --vehicle px4" in line
+    assert "robots = 11: must be from 1 to 10 with --vehicle px4" in line
 
 
 @pytest.mark.parametrize(
