@@ -101,7 +101,7 @@ def _parameter(cls: type[Any], of: Field[Any]) -> inspect.Parameter:
 
 def _choices(hint: Any) -> tuple[str, ...]:
     """The values of a field that has few; none of others."""
-    if get_origin(hint) in (Annotated,):
+    if get_origin(hint) is Annotated:
         return _choices(hint.__origin__)
     if get_origin(hint) is Literal:
         return tuple(get_args(hint))

@@ -337,7 +337,7 @@ def _fly_on_clock(scenario: "Scenario", run: RunOptions) -> None:
 
 
 def _fly_programs(scenario: "Scenario", run: RunOptions, count: int | None) -> None:
-    """RunOptions a fleet of processes; exit code 1 if its flight did not end as it should."""
+    """Fly a fleet of processes; exit code 1 if its flight did not end as it should."""
     from lpac.cli.programs import ProgramsOptions, fly_script, serve
 
     with _folder(run.out if run.script else run.out or DEFAULT_OUT) as folder:

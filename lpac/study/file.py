@@ -156,16 +156,8 @@ def condition_of(keys: Mapping[str, object], where: str, folder: Path = Path()) 
     for key in keys:
         if key not in known:
             raise ConfigError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")
-    set_up = SET_UPS[own.set_up]
-    sizes = {
-        "robots": set_up.robots,
-        "world_size": set_up.world_size,
-        "communication_range": float(set_up.communication_range),
-        "random_feature_count": set_up.features,
-        "random_feature_sigma": list(set_up.sigma),
-    }
     others = {key: value for key, value in keys.items() if key not in own_names}
-    scenario = from_mapping(Scenario, {**sizes, **others}, where)
+    scenario = from_mapping(Scenario, {**SET_UPS[own.set_up].sizes, **others}, where)
     try:
         if own.world:
             path = folder / own.world

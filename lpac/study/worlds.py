@@ -51,18 +51,20 @@ class SetUp:
                 f"communication_range = {self.communication_range}: must be positive and finite"
             )
 
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """The sizes by their names in a scenario."""
+        return {
+            "robots": self.robots,
+            "world_size": self.world_size,
+            "communication_range": self.communication_range,
+            "random_feature_count": self.features,
+            "random_feature_sigma": self.sigma,
+        }
+
     def scenario(self, **changes: Any) -> Scenario:
         """A flight in this set-up, which is otherwise than usual in what `changes` say."""
-        return Scenario(
-            **{
-                "robots": self.robots,
-                "world_size": self.world_size,
-                "communication_range": self.communication_range,
-                "random_feature_count": self.features,
-                "random_feature_sigma": self.sigma,
-                **changes,
-            }
-        )
+        return Scenario(**{**self.sizes, **changes})
 
     @classmethod
     def of(cls, scenario: Scenario) -> "SetUp":
