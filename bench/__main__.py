@@ -17,9 +17,7 @@ BENCHES = (
     "footprint",
     "scaling",
     "simulated",
-    "closed_loop",
     "usual",
-    "hearing",
     "loops",
 )
 

@@ -1,18 +1,25 @@
-"""What a robot's policy process tells `footprint` about itself, ours and torch's alike."""
+"""`python -m bench.first_tick edge|torch`: a robot's policy process, for `footprint`.
+
+Each imports its own half alone, since what is measured is what a process loads.
+"""
 
 import json
 import os
+import sys
 from collections.abc import Callable
 
+import numpy as np
+
+from bench import BUNDLE, CHECKPOINT
 from bench.usage import usage
 
 TICKED = "ticked\n"
 TICKS = 20
 
 # Mission frame, m; the neighbours are all in range.
-POSITION_M = (16.0, 16.0, 0.0)
-NEIGHBOURS_M = tuple((10.0 + i, 12.0, 0.0) for i in range(10))
-ENV_SCALE = 16.0
+_POSITION_M = (16.0, 16.0, 0.0)
+_NEIGHBOURS_M = tuple((10.0 + i, 12.0, 0.0) for i in range(10))
+_ENV_SCALE = 16.0
 
 
 def run(tick: Callable[[], object]) -> None:
@@ -23,3 +30,67 @@ def run(tick: Callable[[], object]) -> None:
         tick()
     taken = usage(os.getpid())
     print(json.dumps({"rss": taken.resident_mb, "private": taken.private_mb}), flush=True)
+
+
+def edge() -> Callable[[], object]:
+    """Load the bundle and hear ten neighbours; returns a tick."""
+    from edge.core.aggregation import AggregatedMessage
+    from edge.core.fleet_time import FleetTime
+    from edge.core.frames import ModelScale
+    from edge.core.ports import Odometry
+    from edge.core.wire import encode
+    from edge.drivers.world_sensor import WorldSensor
+    from edge.policy.bundle import load_bundle
+    from edge.policy.lpac.policy import LpacPolicy
+    from edge.robot.pac import Pac, PacParameters
+
+    class Standing:
+        def odometry(self) -> Odometry:
+            return Odometry(_POSITION_M, (0.0, 0.0, 0.0))
+
+    policy = LpacPolicy(load_bundle(BUNDLE))
+    perception = policy.manifest.perception
+    assert perception
+    importance = np.ones((perception.world_size,) * 2, np.float32)
+    robot = Pac(
+        robot_id=0,
+        boot_epoch=1,
+        policy=policy,
+        sensor=WorldSensor(importance, perception.sensor_size),
+        odometry=Standing(),
+        parameters=PacParameters(scale=ModelScale(_ENV_SCALE, 0.25), max_speed_m_s=1.25),
+    )
+    robot.clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+    payload = np.zeros(policy.message_size, np.float32)
+    time, still = FleetTime(1, 0.0, 0.0), (0.0, 0.0, 0.0)
+    for number, position_m in enumerate(_NEIGHBOURS_M, 1):
+        message = AggregatedMessage(
+            number, 1, 1, time, position_m, velocity_m_s=still, frame_id=0, payload=payload
+        )
+        robot.receive(encode(message, policy.bundle_id, "float16"), now_s=0.0)
+
+    def tick() -> None:
+        robot.perceive(now_s=0.0)
+        assert robot.infer(now_s=0.0)
+
+    return tick
+
+
+def torch() -> Callable[[], object]:
+    """Load the checkpoint; returns a tick with the same ten neighbours."""
+    from bench.torch_robot import PygLayer, TorchRobot, load_network
+    from edge.core.perception import PerceptionParameters
+
+    perception = PerceptionParameters(
+        world_size=512, local_map_size=256, sensor_size=64, communication_range=256.0
+    )
+    network = load_network(CHECKPOINT, PygLayer)
+    robot = TorchRobot(network, perception, 32, np.ones((perception.world_size,) * 2, np.float32))
+    message_size = sum(hops * inputs for hops, inputs in network.held_shapes)
+    payloads = [np.zeros(message_size, np.float32)] * len(_NEIGHBOURS_M)
+    position, *neighbours = _ENV_SCALE * np.array((_POSITION_M, *_NEIGHBOURS_M))[:, :2]
+    return lambda: robot.tick(position, np.array(neighbours), payloads)
+
+
+if __name__ == "__main__":
+    run({"edge": edge, "torch": torch}[sys.argv[1]]())

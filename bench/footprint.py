@@ -69,7 +69,7 @@ def _run(kind: str) -> dict[str, float]:
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     start_s = perf_counter()
     with subprocess.Popen(
-        [sys.executable, "-m", f"bench.first_tick_{kind}"],
+        [sys.executable, "-m", "bench.first_tick", kind],
         cwd=ROOT,
         env=environment,
         stdout=subprocess.PIPE,

@@ -13,7 +13,7 @@ from edge.core.world import random_features, rasterize
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Manifest
 from edge.policy.family import Policy
-from edge.robot.pac import Pac, PacParameters
+from edge.robot.pac import PacParameters
 from lpac.sim.description import FIELD_SCALE
 from lpac.sim.medium import Medium
 from lpac.sim.swarm import pac_swarm
@@ -33,8 +33,6 @@ class Moment:
     (world_size, world_size) is the same as one array. `messages` are the neighbours' newest.
     """
 
-    robot: Pac
-    now_s: float
     position: F64
     neighbours: F64
     messages: tuple[AggregatedMessage, ...]
@@ -86,7 +84,7 @@ def moment_in_flight(policy: Policy) -> Moment:
             near = neighbours_in_range(position, neighbours, perception.communication_range)
             if now_s >= _EARLIEST_S and len(messages) == near.sum() == NEIGHBOURS:
                 memory, robot_map = _seen_on(path, importance, manifest)
-                return Moment(robot, now_s, position, neighbours, messages, memory, robot_map)
+                return Moment(position, neighbours, messages, memory, robot_map)
     raise AssertionError(f"no robot had {NEIGHBOURS} neighbours")
 
 

@@ -18,11 +18,10 @@ from bench.timing import interleaved, quartiles, with_quartiles
 from bench.torch_robot import Network, PygLayer, TapLayer, TorchRobot, exchange_inputs, load_network
 from edge.core import F32
 from edge.core.aggregation import HopBuffer
-from edge.core.wire import decode, encode
 from edge.policy.bundle import load_bundle
 from edge.policy.family import Observation
 from edge.policy.lpac.images import PolicyImages
-from edge.policy.lpac.manifest import ACTION, gnn_graph
+from edge.policy.lpac.manifest import gnn_graph
 from edge.policy.lpac.policy import LpacPolicy
 
 EDGE, TRACED, EAGER = "lpac-edge", "torch traced", "torch + PyG eager"
@@ -32,7 +31,7 @@ Outputs = tuple[F32, F32]
 
 
 def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
-    """Whole tick, graph neural network alone, the parts of our tick, and the CNN's efficiency.
+    """Whole tick, graph neural network alone, and the CNN's efficiency.
 
     Raises RuntimeError if the variants' outputs differ by more than TOLERANCE.
     """
@@ -45,7 +44,7 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
     taps = load_network(CHECKPOINT, TapLayer)
 
     ticks = {EDGE: robot.tick, **_torch_ticks(eager, taps, moment, policy)}
-    exchanges = {EDGE: robot.exchange, **_torch_exchanges(eager, taps, moment, robot.features)}
+    exchanges = {EDGE: robot.exchange, EAGER: _torch_exchange(eager, moment, robot.features)}
     figures: dict[str, Any] = {"neighbours": NEIGHBOURS, "rounds": rounds}
     tables = []
     for name, variants in (("tick", ticks), ("gnn", exchanges)):
@@ -56,19 +55,10 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
         figures[name] = {"largest_difference": error, **_compared(variants, rounds, round_s)}
         tables.append(_comparison_table(name, figures[name]))
 
-    progress("policy: parts")
-    times = interleaved(robot.parts(), rounds, round_s / 4)
-    figures["parts_us"] = {name: quartiles(1e6 * t) for name, t in times.items()}
-    tables.append(
-        Table(
-            f"The parts of our tick, {NEIGHBOURS} neighbours, each alone in a loop",
-            ("part", "us, median (quartiles)"),
-            [(name, with_quartiles(us, 1)) for name, us in figures["parts_us"].items()],
-        )
-    )
-
     progress("policy: CNN")
-    figures["cnn"] = cnn.measure(bundle, robot.images, rounds // 2, round_s)
+    figures["cnn"] = cnn.measure(
+        policy.image_features, eager.cnn_backbone, robot.images(), rounds // 2, round_s
+    )
     tables.append(cnn.table(figures["cnn"]))
     return Result(
         "policy",
@@ -106,7 +96,6 @@ class EdgeRobot:
         assert images
         self._images = PolicyImages(policy.manifest.perception, images.channels, images.size)
         self._agent = policy.agent()
-        self.images = self._make_images().copy()
         self.features = self._agent.observe(self._observation()).features
 
     def tick(self) -> Outputs:
@@ -117,36 +106,15 @@ class EdgeRobot:
     def exchange(self) -> Outputs:
         """The graph neural network alone: x_L (F_L,) and message (message_size,)."""
         self._hops.diffuse(self._moment.payloads, NEIGHBOURS)
-        return self._layers(), self._hops.message(NEIGHBOURS)
+        features = self.features
+        for number, layer in enumerate(self._hops.layers, 1):
+            layer[0, 0] = features
+            features = self._policy.run(gnn_graph(number), layer)[0]
+        return features, self._hops.message(NEIGHBOURS)
 
-    def parts(self) -> dict[str, Callable[[], object]]:
-        """What a robot does for a tick, in order, and the steps of `Pac` as a whole."""
-        moment, policy = self._moment, self._policy
-        last = self._layers()[None]
-        own = moment.messages[0]
-        wire = [encode(message, policy.bundle_id, "float16") for message in moment.messages]
-
-        def decode_all() -> None:
-            for data in wire:
-                decode(
-                    data,
-                    bundle_id=policy.bundle_id,
-                    frame_id=0,
-                    message_size=policy.message_size,
-                )
-
-        return {
-            f"decode {NEIGHBOURS} messages": decode_all,
-            "images": self._make_images,
-            "CNN": lambda: policy.image_features(self.images),
-            "aggregation": lambda: self._hops.diffuse(moment.payloads, NEIGHBOURS),
-            "layers": self._layers,
-            "action": lambda: policy.run(ACTION, last),
-            "own message": lambda: self._hops.message(NEIGHBOURS),
-            "encode": lambda: encode(own, policy.bundle_id, "float16"),
-            "whole step: Pac.perceive": lambda: moment.robot.perceive(moment.now_s),
-            "whole step: Pac.infer": lambda: moment.robot.infer(moment.now_s),
-        }
+    def images(self) -> F32:
+        """(1, channels, size, size): what the CNN sees."""
+        return self._images.images(*self._observation()[:3]).copy()
 
     def _observation(self) -> Observation:
         moment = self._moment
@@ -156,27 +124,6 @@ class EdgeRobot:
             moment.neighbours,
             np.zeros(2),
         )
-
-    def _make_images(self) -> F32:
-        return self._images.images(*self._observation()[:3])
-
-    def _layers(self) -> F32:
-        features = self.features
-        for number, layer in enumerate(self._hops.layers, 1):
-            layer[0, 0] = features
-            features = self._policy.run(gnn_graph(number), layer)[0]
-        return features
-
-
-class _Exchange(nn.Module):
-    """The graph neural network of a `Network` alone, so that it can be traced."""
-
-    def __init__(self, network: Network) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, features: Tensor, payloads: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-        return self.network.exchange(features, payloads, scale)
 
 
 def _torch_ticks(
@@ -194,19 +141,14 @@ def _torch_ticks(
     return {TRACED: lambda: traced.tick(*inputs), EAGER: lambda: with_pyg.tick(*inputs)}
 
 
-def _torch_exchanges(
-    eager: Network, taps: Network, moment: Moment, features: F32
-) -> dict[str, Callable[[], Outputs]]:
-    def inputs() -> tuple[Tensor, ...]:
-        return torch.from_numpy(features[None]), *exchange_inputs(moment.payloads)
-
-    def exchange(network: Callable[..., tuple[Tensor, Tensor]]) -> Outputs:
+def _torch_exchange(eager: Network, moment: Moment, features: F32) -> Callable[[], Outputs]:
+    def exchange() -> Outputs:
         with torch.inference_mode():
-            last, message = network(*inputs())
+            own = torch.from_numpy(features[None])
+            last, message = eager.exchange(own, *exchange_inputs(moment.payloads))
             return last[0].numpy(), message.numpy()
 
-    traced = _frozen(_Exchange(taps).eval(), inputs())
-    return {TRACED: lambda: exchange(traced), EAGER: lambda: exchange(eager.exchange)}
+    return exchange
 
 
 def _frozen(module: nn.Module, inputs: tuple[Tensor, ...]) -> Callable[..., Any]:

@@ -4,56 +4,46 @@ import gc
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import replace
-from multiprocessing import get_context
 from time import perf_counter, process_time
 from typing import Any
 
+import numpy as np
+
 from bench import BUNDLE
 from bench.result import Result, Table, Target, progress
+from bench.timing import in_own_process
 from bench.usage import usage
-from edge.core import F32, F64
-from edge.core.coverage import coverage_cost
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.sim.batch import BatchedFlights
-from lpac.sim.experiment import SAMPLE_S, SAMPLES_PER_COST
+from lpac.sim.experiment import SAMPLE_S
 from lpac.sim.experiment import fly as fly_exactly
 from lpac.sim.scenario import Scenario
 
-EXACT, BATCHED, TWO_THREADS = "exact", "batched", "batched, 2 threads"
+EXACT, BATCHED = "exact", "batched"
 # Of training: ten robots and ten features in one world.
 _ROBOTS_PER_WORLD = 10
 # (robots, simulated seconds, flights)
 _FLIGHTS = ((10, 30.0, 3), (100, 6.0, 3), (1000, 2.0, 1))
 # Robots see more of the world the longer they fly, so all are weighed at the same age.
 _MEMORY_AT_S = 2.0
-# Up to so many robots a second thread finds nothing to do.
-_ONE_THREAD_ROBOTS = 100
-
-# Called with the simulated time, from 0 to the flight's end.
-Note = Callable[[float], None]
 
 
 def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Result:
     """Flights in processes of their own, one at a time; `flights` are robots, seconds, repeats."""
     figures: dict[str, dict[str, Any]] = {}
-    with ProcessPoolExecutor(
-        max_workers=1, max_tasks_per_child=1, mp_context=get_context("spawn")
-    ) as processes:
-        for robots, duration_s, repeats in flights:
-            progress(f"scaling: {robots} robots, {duration_s:g} s, {repeats} times")
-            runs: dict[str, list[dict[str, float]]] = {name: [] for name in _simulators(robots)}
-            # In turn, so that whatever else the machine does meets all of them.
-            for seed in range(repeats):
-                for name, of_simulator in runs.items():
-                    flight = processes.submit(_measure_flight, name, robots, duration_s, seed)
-                    of_simulator.append(flight.result())
-            figures[str(robots)] = {
-                name: sorted(each, key=lambda run: run["cpu_ms_per_robot_s"])[repeats // 2]
-                for name, each in runs.items()
-            }
+    for robots, duration_s, repeats in flights:
+        progress(f"scaling: {robots} robots, {duration_s:g} s, {repeats} times")
+        runs: dict[str, list[dict[str, float]]] = {name: [] for name in (EXACT, BATCHED)}
+        # In turn, so that whatever else the machine does meets all of them.
+        for seed in range(repeats):
+            for name, of_simulator in runs.items():
+                flight = in_own_process(_measure_flight, name, robots, duration_s, seed)
+                of_simulator.append(flight)
+        figures[str(robots)] = {
+            name: sorted(each, key=lambda run: run["cpu_ms_per_robot_s"])[repeats // 2]
+            for name, each in runs.items()
+        }
     rows = [
         (
             f"{robots}",
@@ -63,14 +53,13 @@ def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Result:
             f"{run['real_time_factor']:.2f}",
             f"{run['cpu_ms_per_robot_s']:.2f}",
             f"{run['memory_mb_per_robot']:.2f}",
-            f"{100 * run['cost_evaluation_share']:.0f} %",
         )
         for robots, runs_of in figures.items()
         for name, run in runs_of.items()
     ]
     columns = (
         "robots", "simulator", "world", "simulated, s", "x real time", "CPU ms per robot and s",
-        f"MB per robot at {_MEMORY_AT_S:g} s", "cost J's share",
+        f"MB per robot at {_MEMORY_AT_S:g} s",
     )  # fmt: skip
     return Result(
         "scaling",
@@ -78,10 +67,10 @@ def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Result:
         [Table("Simulators of points at constant density", columns, rows)],
         list(_targets(figures)),
         [
-            "One core each, but for two threads. Field scale; the world's area and its features "
-            "grow with the robots. Of several flights the median by processor time. Times leave "
-            "out making the world, but include the coverage cost J once a second; memory includes "
-            "the world's raster, but not the program."
+            "One core each. Field scale; the world's area and its features grow with the robots. "
+            "Of several flights the median by processor time. Times leave out making the world, "
+            "but include the coverage cost J once a second; memory includes the world's raster, "
+            "but not the program."
         ],
     )
 
@@ -95,20 +84,11 @@ def world_for(bundle: Bundle, robots: int) -> Bundle:
     return replace(bundle, manifest=replace(bundle.manifest, perception=larger))
 
 
-def _simulators(robots: int) -> tuple[str, ...]:
-    return (EXACT, BATCHED) if robots <= _ONE_THREAD_ROBOTS else (EXACT, BATCHED, TWO_THREADS)
-
-
 def _targets(figures: dict[str, dict[str, Any]]) -> Iterator[Target]:
     smallest = next(iter(figures))
     for name, limit in ((EXACT, 20.0), (BATCHED, 30.0)):
         factor = figures[smallest][name]["real_time_factor"]
         yield Target(f"{smallest} robots, {name}: times real time", factor, limit, at_least=True)
-    for robots, of in figures.items():
-        if TWO_THREADS in of:
-            factor = of[TWO_THREADS]["real_time_factor"]
-            what = f"{robots} robots, {TWO_THREADS}: times real time"
-            yield Target(what, factor, 0.6, at_least=True)
     memory_mb_per_robot = max(of[BATCHED]["memory_mb_per_robot"] for of in figures.values())
     yield Target(f"{BATCHED}: MB per robot", memory_mb_per_robot, 1.0, at_least=False)
 
@@ -125,46 +105,36 @@ def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dic
     def note(time_s: float) -> None:
         nonlocal flying_mb, wall_s, cpu_s
         if time_s == 0.0:
-            wall_s, cpu_s = -perf_counter(), -process_time()
-        if time_s <= min(_MEMORY_AT_S, duration_s) + SAMPLE_S / 2:
+            wall_s, cpu_s = perf_counter(), process_time()
+        if time_s <= _MEMORY_AT_S + SAMPLE_S / 2:
             flying_mb = usage(os.getpid()).resident_mb
-        if time_s >= duration_s:
-            wall_s, cpu_s = wall_s + perf_counter(), cpu_s + process_time()
 
     scenario = Scenario(
         robots=robots, seed=seed, duration_s=duration_s, random_feature_count=robots
     )
     larger = world_for(bundle, robots)
-    cost_s = _fly(name, scenario, larger, note)
+    _fly(name, scenario, larger, note)
+    wall_s, cpu_s = perf_counter() - wall_s, process_time() - cpu_s
     assert larger.manifest.perception
     return {
         "robots": robots,
         "world_size": larger.manifest.perception.world_size,
         "duration_s": duration_s,
-        "real_time_factor": duration_s / (wall_s + cost_s),
-        "cpu_ms_per_robot_s": 1e3 * (cpu_s + cost_s) / robots / duration_s,
+        "real_time_factor": duration_s / wall_s,
+        "cpu_ms_per_robot_s": 1e3 * cpu_s / robots / duration_s,
         "memory_mb_per_robot": (flying_mb - empty_mb) / robots,
-        "cost_evaluation_share": cost_s / (wall_s + cost_s),
     }
 
 
-def _fly(name: str, scenario: Scenario, bundle: Bundle, note: Note) -> float:
-    """Fly; returns what J once a second takes, s, which is not part of the noted time."""
+def _fly(name: str, scenario: Scenario, bundle: Bundle, note: Callable[[float], None]) -> None:
+    """Fly, and note the simulated time, from 0 to the flight's end."""
     if name == EXACT:
-        flight = fly_exactly(scenario, bundle, lambda moment: note(moment.time_s))
-        return _cost_s(scenario, flight.importance, flight.positions_m)
-    with ThreadPoolExecutor(1) if name == TWO_THREADS else nullcontext() as executor:
-        flights = BatchedFlights([scenario], bundle, executor)
-        [prepared] = flights.prepared
-        positions_m = []
-        for [moment] in flights.moments(prepared.times_s):
-            positions_m.append(moment.positions_m)
-            note(moment.time_s)
-    return _cost_s(scenario, prepared.importance, positions_m)
-
-
-def _cost_s(scenario: Scenario, importance: F32, positions_m: Sequence[F64] | F64) -> float:
-    start_s = perf_counter()
-    for each_m in positions_m[SAMPLES_PER_COST::SAMPLES_PER_COST]:
-        coverage_cost(importance, scenario.scale.position_to_model(each_m))
-    return perf_counter() - start_s
+        fly_exactly(scenario, bundle, lambda moment: note(moment.time_s))
+        return
+    flights = BatchedFlights([scenario], bundle)
+    [prepared], [swarm] = flights.prepared, flights.swarms
+    positions_m = []
+    for [moment] in flights.moments(prepared.times_s):
+        positions_m.append(moment.positions_m)
+        note(moment.time_s)
+    prepared.flight(np.array(positions_m), swarm.message_counts(), swarm.largest_payload)

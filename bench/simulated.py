@@ -2,13 +2,12 @@
 
 import gc
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter, process_time
 
 from bench import BUNDLE
 from bench.result import Result, Table, Target, progress
+from bench.timing import in_own_process
 from edge.core.logger import show
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.scenario import Scenario
@@ -16,13 +15,10 @@ from lpac.sim.scenario import Scenario
 
 def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Result:
     """Flights in processes of their own, one at a time: from the pads to the pads."""
-    with ProcessPoolExecutor(
-        max_workers=1, max_tasks_per_child=1, mp_context=get_context("spawn")
-    ) as processes:
-        flights = []
-        for run in range(runs):
-            progress(f"simulated: {robots} robots, flight {run + 1} of {runs}")
-            flights.append(processes.submit(_fly, robots, mission_s).result())
+    flights = []
+    for run in range(runs):
+        progress(f"simulated: {robots} robots, flight {run + 1} of {runs}")
+        flights.append(in_own_process(_fly, robots, mission_s))
     flights.sort(key=lambda flight: flight["real_time_factor"])
     median = flights[runs // 2]
     return Result(

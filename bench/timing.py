@@ -1,14 +1,19 @@
-"""Times of variants in one run, interleaved, so that a noisy machine disturbs all alike."""
+"""Run what is timed: variants in turn in one process, or each run in a process of its own."""
 
 import gc
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from time import perf_counter
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 
 from edge.core import F64
 
 _WARM_UP_CALLS = 10
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
 def interleaved(
@@ -31,6 +36,12 @@ def interleaved(
     finally:
         gc.enable()
     return times
+
+
+def in_own_process(run: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
+    """What `run` returns, called in a fresh process, so that no run finds another's memory."""
+    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as process:
+        return process.submit(run, *args, **kwargs).result()
 
 
 def quartiles(values: F64 | list[float]) -> dict[str, float]:

@@ -121,8 +121,7 @@ def _computation(effort: Effort) -> Claim:
         f"{1e3 * effort.of_two_s:.2f} ms with two, {1e3 * effort.of_hundred_s:.2f} ms with a "
         f"hundred, {ratio:.2f} times as long. The networks compute the same in both; only drawing "
         "the maps and adding up messages grows with the number heard. Authenticating and decoding "
-        "what others say is not included, and grows with all that send "
-        "(`python -m bench hearing`).",
+        "what others say is not included, and grows with all that send.",
         _agrees(ratio <= _AS_LONG),
     )
 

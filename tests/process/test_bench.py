@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
-from bench import footprint, hearing, loops, scaling, simulated
+from bench import footprint, loops, scaling, simulated
 from tests.unit.test_bench import check_frame, kept
 
 
@@ -40,12 +40,3 @@ def test_simulated(tmp_path: Path) -> None:
     check_frame(result, "simulated", targets=1)
     (flight,) = result["figures"]["1"]
     assert flight["simulated_s"] > 10.0 and flight["cpu_s"] > 0.0
-
-
-@pytest.mark.alone
-def test_hearing(tmp_path: Path) -> None:
-    result = kept(hearing.measure(others=(9,), seconds=2.0, robots=2), tmp_path)
-    check_frame(result, "hearing", targets=1)
-    nine = result["figures"]["9"]
-    # What is on its way at either end of the time is counted at one of them alone.
-    assert nine["messages_hz"] > 0.0 and nine["taken"] == pytest.approx(1.0, abs=0.2)

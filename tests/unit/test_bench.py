@@ -9,7 +9,7 @@ from rich.console import Console
 
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
-from bench import closed_loop, policy, scaling
+from bench import policy, scaling
 from bench.result import Result
 from edge.policy.bundle import Bundle
 
@@ -33,14 +33,13 @@ def check_frame(result: dict[str, Any], name: str, targets: int) -> None:
 def test_policy(tmp_path: Path) -> None:
     result = kept(policy.measure(rounds=2, round_s=0.001), tmp_path)
     check_frame(result, "policy", targets=4)
-    variants = {policy.EDGE, policy.TRACED, policy.EAGER}
-    for name in ("tick", "gnn"):
+    both = {policy.EDGE, policy.EAGER}
+    for name, variants in (("tick", {*both, policy.TRACED}), ("gnn", both)):
         figures = result["figures"][name]
         assert figures["largest_difference"] <= policy.TOLERANCE
         assert set(figures["slower_than_edge"]) == variants
         assert figures["slower_than_edge"][policy.EDGE]["median"] == 1.0
-    cnn = result["figures"]["cnn"]
-    assert sum(operator["flop"] for operator in cnn["operators"]) == cnn["flop"] > 30e6
+    assert result["figures"]["cnn"]["flop"] > 30e6
 
 
 @pytest.mark.parametrize(("robots", "world_size"), [(1, 162), (2, 229), (10, 512)])
@@ -49,11 +48,3 @@ def test_robots_of_the_scaling_bench_have_as_much_room_each(
 ) -> None:
     perception = scaling.world_for(shipped_bundle, robots).manifest.perception
     assert perception is not None and perception.world_size == world_size
-
-
-def test_closed_loop(tmp_path: Path) -> None:
-    result = kept(closed_loop.measure(worlds=2, duration_s=0.4, draws=1), tmp_path)
-    check_frame(result, "closed_loop", targets=2)
-    costs = result["figures"]["normalized_cost"]
-    assert set(costs) == {closed_loop.LPAC, closed_loop.LOSSY, closed_loop.RIVAL}
-    assert all(len(cost) == 2 for cost in costs.values())

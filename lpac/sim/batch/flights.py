@@ -6,7 +6,6 @@ vehicles act is that of `lpac.sim.experiment.fly`, and so is what comes out, for
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from functools import partial
 from typing import NamedTuple
 
@@ -66,12 +65,9 @@ class BatchedFlights:
         self,
         scenarios: Sequence[Scenario],
         bundle: Bundle,
-        executor: Executor | None = None,
         agents: Callable[[Bundle, Sequence[PerceptionParameters]], Agents] = make_agents,
     ) -> None:
-        """An `executor` of one thread puts a second core to use, where robots are many.
-
-        `agents` makes who decides, for all robots of all worlds in their order.
+        """`agents` makes the policies of all robots of all worlds in their order.
 
         Raises BundleError and ConfigError as `load_policy`; ValueError, also for a baseline.
         """
@@ -84,9 +80,7 @@ class BatchedFlights:
         perceptions = [
             world.perception for world in self.prepared for _ in range(world.scenario.robots)
         ]
-        self._deferred = DeferredSteps(
-            agents(bundle, perceptions), bundle.manifest.payload_limit, executor
-        )
+        self._deferred = DeferredSteps(agents(bundle, perceptions), bundle.manifest.payload_limit)
         firsts = np.cumsum([0, *(scenario.robots for scenario in scenarios)]).tolist()
         self.swarms = tuple(
             self._swarm(world, first)

@@ -7,7 +7,6 @@ leaves a `DeferredStep` to be computed later, together with others' (`DeferredSt
 
 from collections import defaultdict
 from collections.abc import Sequence
-from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -39,8 +38,6 @@ def _age_error_s() -> float:
 
 
 _AGE_ERROR_S = _age_error_s()
-# The number of steps whose features are computed together while the flight goes on.
-_AHEAD = 8
 
 
 @dataclass(slots=True, eq=False)
@@ -66,35 +63,24 @@ class DeferredStep:
 class DeferredSteps:
     """The steps, of all robots of `agents`, that are not computed yet."""
 
-    def __init__(
-        self, agents: Agents, payload_limit: float | None, executor: Executor | None
-    ) -> None:
-        """`payload_limit` is that of the bundle's manifest.
-
-        An `executor` computes features as soon as some are to be computed; without one, all that
-        there are are computed at once when the first is needed.
-        """
+    def __init__(self, agents: Agents, payload_limit: float | None) -> None:
+        """`payload_limit` is that of the bundle's manifest."""
         self.agents = agents
         self._payload_limit = np.inf if payload_limit is None else payload_limit
-        self._executor = executor
         self._steps: list[DeferredStep] = []
-        # Of the first of them: what is being computed, _AHEAD steps each.
-        self._ahead: list[Future[list[F32]]] = []
 
     def add(self, step: DeferredStep) -> None:
         """Compute it later."""
         self._steps.append(step)
-        if self._executor and len(self._steps) % _AHEAD == 0:
-            self._ahead.append(self._executor.submit(self._features, self._steps[-_AHEAD:]))
 
     def compute(self) -> None:
         """Compute them all. Raises PolicyFailedError."""
         steps, self._steps = self._steps, []
-        ahead, self._ahead = self._ahead, []
         if not steps:
             return
-        last = self._features(steps[len(ahead) * _AHEAD :])
-        features = [*(one for each in ahead for one in each.result()), *last]
+        features = self.agents.features(
+            [step.robot.agent for step in steps], [step.inputs for step in steps]
+        )
         ranked = defaultdict(list)
         for i, step in enumerate(steps):
             ranked[step.rank].append(i)
@@ -103,13 +89,6 @@ class DeferredSteps:
         for step in steps:
             # What it was computed from would hold on to all that was before.
             step.inputs, step.heeded = {}, ()
-
-    def _features(self, steps: list[DeferredStep]) -> list[F32]:
-        if not steps:
-            return []
-        return self.agents.features(
-            [step.robot.agent for step in steps], [step.inputs for step in steps]
-        )
 
     def _step(self, steps: list[DeferredStep], features: list[F32]) -> None:
         velocities, payloads = self.agents.step(

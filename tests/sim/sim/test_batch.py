@@ -5,7 +5,6 @@ a batch as it computes it alone. So flights are equal to the last bit.
 """
 
 import dataclasses
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -170,15 +169,6 @@ def test_agents_one_by_one_fly_the_same(
     monkeypatch.setattr("lpac.sim.batch.flights.make_agents", SingleAgents)
     for bundle, flights in zip(bundles, expected, strict=True):
         assert_same(*fly_batch([HARD], bundle), *flights)
-
-
-def test_a_second_thread_changes_nothing(shipped_bundle: Bundle) -> None:
-    scenario = Scenario(robots=60, duration_s=2.0, world_size=1000, communication_range=128.0)
-    [expected] = fly_batch([scenario], shipped_bundle)
-    with ThreadPoolExecutor(1) as executor:
-        flights = BatchedFlights([scenario], shipped_bundle, executor)
-        [[moment]] = flights.moments([2.0])
-    np.testing.assert_array_equal(moment.positions_m, expected.positions_m[-1])
 
 
 @settings(max_examples=60, deadline=None)
