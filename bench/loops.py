@@ -30,7 +30,7 @@ _LOOK_EVERY_S = 1.0
 
 
 class _Taken(NamedTuple):
-    """What a robot's program takes: `cpu_percent` of one core, by thread; the rest as `Usage`."""
+    """Resources of a robot's program: `cpu_percent` of one core, by thread; the rest as `Usage`."""
 
     cpu_percent: dict[str, float]
     threads: int

@@ -94,7 +94,7 @@ def _positions(messages: Sequence[AggregatedMessage]) -> F64:
 
 
 def _seen_on(path: F64, importance: F32, manifest: Manifest) -> tuple[RobotMemory, F32]:
-    """What a robot remembers that flew along `path` (T, 2)."""
+    """Memory and map of a robot that flew along `path` (T, 2)."""
     parameters = manifest.perception
     assert parameters
     memory = RobotMemory(parameters)

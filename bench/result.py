@@ -1,4 +1,4 @@
-"""What every bench hands back, and how it is shown and kept."""
+"""Results of benches: how they are shown and kept."""
 
 import json
 import os
@@ -50,7 +50,7 @@ class Result:
     notes: list[str] = field(default_factory=list)
 
     def as_json(self) -> dict[str, Any]:
-        """What is kept of it."""
+        """The result as JSON values, as it is kept."""
         return {
             "bench": self.name,
             "machine": _machine(),

@@ -39,7 +39,7 @@ def interleaved(
 
 
 def in_own_process(run: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
-    """What `run` returns, called in a fresh process, so that no run finds another's memory."""
+    """Call `run` in a fresh process, so that no run finds another's memory; return its result."""
     with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as process:
         return process.submit(run, *args, **kwargs).result()
 

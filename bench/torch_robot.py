@@ -150,7 +150,7 @@ class TorchRobot:
             return velocity.numpy(), message.numpy()
 
     def inputs(self, position: F64, neighbours: F64, payloads: Sequence[F32]) -> tuple[Tensor, ...]:
-        """What the network takes."""
+        """Inputs of the network."""
         perception = self._perception
         size, world_size = perception.local_map_size, perception.world_size
         in_world, in_map = part_in_world(window_corner(position, size), size, world_size)

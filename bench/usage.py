@@ -1,4 +1,4 @@
-"""What a process takes: processor time, by thread, threads, and memory."""
+"""Resources of a process: processor time by thread, number of threads, memory."""
 
 import os
 import re
@@ -18,7 +18,7 @@ class Usage(NamedTuple):
 
 
 def usage(pid: int) -> Usage:
-    """What a process of this machine takes now. Raises OSError if it has ended."""
+    """Measure a process of this machine now. Raises OSError if it has ended."""
     cpu_s: defaultdict[str, float] = defaultdict(float)
     tasks = list(Path(f"/proc/{pid}/task").iterdir())
     for task in tasks:

@@ -1,1 +1,1 @@
-"""What runs on the robot."""
+"""The robot's program."""

@@ -310,7 +310,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _load(content: bytes, path: Path) -> object:
-    """What the file holds, as long as that is tensors and plain containers."""
+    """Load the file, as long as it holds tensors and plain containers."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the error below says all that they would

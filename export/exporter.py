@@ -86,7 +86,7 @@ def _doubt(checkpoint: Path, network: Checkpoint, trained: PolicyParameters) -> 
 def _other_than_beside(
     checkpoint: Path, network: Checkpoint, trained: PolicyParameters
 ) -> str | None:
-    """What a bundle of this checkpoint in the folder of its name says otherwise."""
+    """Describe how a bundle of this checkpoint in the folder of its name differs."""
     beside = checkpoint.with_suffix("")
     try:
         manifest = load_bundle(beside).manifest

@@ -170,7 +170,7 @@ def _balanced(rows: F64, weight: F64, bias: F32 | F64) -> F32:
 
 
 def _neighbours() -> npt.NDArray[np.bool_]:
-    """Who hears whom, (N, N): a random geometric graph, from which the last robot is cut off."""
+    """Adjacency, (N, N): a random geometric graph, from which the last robot is cut off."""
     positions = _random().uniform(0, 1, (_ROBOTS, 2))
     near: npt.NDArray[np.bool_] = np.hypot(*(positions[:, None] - positions[None]).T) < _RANGE
     np.fill_diagonal(near, False)

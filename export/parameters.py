@@ -14,7 +14,7 @@ from edge.policy.bundle import Training
 
 @dataclass(frozen=True, slots=True)
 class PolicyMessages(Bounded):
-    """What robots take of each other: see `Manifest.payload_limit` and `payload_types`."""
+    """Limits of messages that robots accept: see `Manifest.payload_limit` and `payload_types`."""
 
     payload_limit: Positive | None = None
     payload_types: tuple[PayloadType, ...] = FLOAT_PAYLOADS
@@ -22,7 +22,7 @@ class PolicyMessages(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class PolicyParameters:
-    """What a policy was trained with, and what robots take of its messages: our file's tables."""
+    """Training parameters of a policy, and limits of its messages: our file's tables."""
 
     perception: PerceptionParameters
     training: Training

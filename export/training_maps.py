@@ -1,4 +1,4 @@
-"""What a trained CNN remembers of the maps that it was trained with, and whether a file agrees.
+"""Trace of the training maps in a trained CNN, and whether a parameter file agrees with it.
 
 A batch norm keeps the mean of what it was given in training. Behind the first convolution that is,
 but for the borders, the mean of each image times the sum of its weights: with more filters than

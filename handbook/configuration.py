@@ -1,4 +1,4 @@
-"""What may stand in each file, key by key, from the dataclasses that read it."""
+"""Reference of each configuration file, key by key, from the dataclasses that read it."""
 
 import dataclasses
 import inspect
@@ -89,7 +89,7 @@ def ground() -> str:
 
 
 def training() -> str:
-    """What `lpac train` and `lpac export` read."""
+    """Files of `lpac train` and `lpac export`."""
     return _page(
         "Training",
         "What `lpac train CONFIG.toml` reads. Lengths are in model units, times in seconds. "
@@ -105,7 +105,7 @@ def training() -> str:
 
 
 def ablation() -> str:
-    """What `lpac ablate` reads."""
+    """Files of `lpac ablate`."""
     return _page(
         "Ablation",
         "What `lpac ablate ABLATION.toml` reads. `train` holds keys of "
@@ -117,7 +117,7 @@ def ablation() -> str:
 
 
 def study() -> str:
-    """What `lpac study` reads."""
+    """Files of `lpac study`."""
     return _page(
         "A study",
         "What `lpac study STUDY.toml` reads; `lpac/paper/studies` has the paper's experiments in "
@@ -192,7 +192,7 @@ def _tables(
 
 
 def _about(cls: type[Any]) -> str:
-    """What a dataclass says of itself, but for what it raises: that is for programs."""
+    """A dataclass's docstring, but for what it raises: that is for programs."""
     paragraphs = (inspect.getdoc(cls) or "").split("\n\n")
     return "\n\n".join(each for each in paragraphs if not each.startswith("Raises "))
 

@@ -96,7 +96,7 @@ def python_api() -> str:
 
 
 def page() -> str:
-    """What drivers and policy families are to the rest."""
+    """Interfaces of drivers and policy families."""
     return "\n\n".join(
         [
             "# Interfaces",
@@ -183,7 +183,7 @@ def _comment(line: ast.stmt, source: str) -> list[str]:
 
 
 def _methods(cls: type) -> list[tuple[str, Any]]:
-    """What a class says itself and has words for; of a driver its call, too."""
+    """Members that a class defines itself and documents; of a driver its call, too."""
     return [
         (name, member)
         for name, member in vars(cls).items()

@@ -1,4 +1,4 @@
-"""What travels by radio and what logs hold, from the table of topics and the messages."""
+"""Reference of radio and logs, from the table of topics and the messages."""
 
 import dataclasses
 import inspect

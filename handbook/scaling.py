@@ -41,7 +41,7 @@ class Topology:
     neighbours: float | None = None
 
     def traffic(self, robots: int, payload: PayloadType) -> Traffic:
-        """What such a fleet says."""
+        """Traffic of such a fleet."""
         return Traffic(
             robots=robots, message_bytes=MESSAGE_BYTES[payload], neighbours=self.neighbours
         )

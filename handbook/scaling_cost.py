@@ -19,7 +19,7 @@ IDEAL = "nothing lost or late"
 
 @dataclass(frozen=True, slots=True)
 class FlownTeam:
-    """What a team came to: the first method's cost over the clairvoyant's, and its 95 % interval.
+    """Result of a team: the first method's cost over the clairvoyant's, and its 95 % interval.
 
     `loss` and `delay_s` are what its messages suffered, by the model.
     """

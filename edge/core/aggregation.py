@@ -41,7 +41,7 @@ class Geometry(Bounded):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AggregatedMessage:
-    """What one robot tells its neighbours: Y_j, and where it is.
+    """A robot's message to its neighbours: Y_j, and where it is.
 
     `payload` is (message_size,), float32 or float16: (y_j)_kl in the order [l][k][feature],
     already multiplied by 1/sqrt(d_j), d_j being the sender's number of neighbours.

@@ -46,7 +46,7 @@ class Arrivals(NamedTuple):
         return self.undated + sum(self.by_age)
 
     def since(self, before: "Arrivals") -> "Arrivals":
-        """What was added; `before` is an earlier count of the same receiver."""
+        """Counts since `before`, an earlier count of the same receiver."""
         by_age = zip(self.by_age, before.by_age, strict=True)
         return Arrivals(
             self.sent - before.sent, self.undated - before.undated, tuple(a - b for a, b in by_age)

@@ -1,4 +1,4 @@
-"""What of a frozen dataclass is not as it was, exactly: so that a log need not repeat the rest.
+"""Exact differences between frozen dataclasses, so that a log need not repeat the rest.
 
 Two values are the same if they are so bit by bit: 0.0 and -0.0 are not, and NaN is itself.
 """
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def _listed(value: object) -> object:
-    """What msgspec does not know: arrays, whose numbers are all that counts."""
+    """Encode arrays, which msgspec does not know, by their numbers alone."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     raise NotImplementedError(f"a {type(value).__name__}")
@@ -72,7 +72,7 @@ def _whole(value: object) -> Any:
 
 
 def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
-    """What `before` has become by these `changes`; None: `told` is all of it.
+    """Apply `changes` to `before`; None: `told` is all of it.
 
     Numbers that are not finite may be text. Raises ValueError or TypeError if `told` does not fit.
     """

@@ -128,7 +128,7 @@ def _depth_m(vertices_m: tuple[tuple[float, ...], ...]) -> float | None:
 
 
 def _cut(corners: F64, inward: F64, offset_m: float) -> F64:
-    """What of a convex polygon (n, 2) lies on that side of a line."""
+    """Clip a convex polygon (n, 2) to that side of a line."""
     inside_m = corners @ inward - offset_m
     kept = []
     for k in range(len(corners)):

@@ -1,4 +1,4 @@
-"""What is wrong with a file, in words that tell a person what to do."""
+"""Errors of files, in words that tell a person what to do."""
 
 import errno
 

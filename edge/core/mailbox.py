@@ -119,7 +119,7 @@ class Mailbox:
         return tuple(entry.message for _, entry in received if now_s - entry.born_s < self._kept_s)
 
     def neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
-        """Who is near and where, by robot id; takes nothing away."""
+        """Neighbours and their positions, by robot id; takes nothing away."""
         with self._lock:
             newest = self._handed_out | self._received if self._handed_out else self._received
             received = sorted(newest.items())
@@ -153,7 +153,7 @@ class Mailbox:
             return dict(self._accepted)
 
     def arrivals(self) -> dict[int, Arrivals]:
-        """What came of each neighbour so far, also too late or overtaken, by robot id."""
+        """Counts of messages of each neighbour so far, also late or overtaken ones, by robot id."""
         with self._lock:
             return {sender: known.arrivals for sender, known in self._arrived.items()}
 

@@ -1,4 +1,4 @@
-"""What one robot remembers of the world, from what its sensor shows and what others tell.
+"""A robot's memory of the world, from its sensor and from what others tell.
 
 All maps are indexed [x, y]; one cell is one model unit; positions are in model units.
 """
@@ -18,7 +18,7 @@ TILE_SIZE = 128
 
 
 class RobotMap:
-    """What one robot has seen, in tiles that are made when first seen.
+    """Map of the cells that one robot has seen, in tiles that are made when first seen.
 
     So its cost is that of the area seen, however large the world is.
     """
@@ -78,7 +78,7 @@ class RobotMap:
 
 
 class RobotMemory:
-    """What one robot has seen of the world.
+    """One robot's memory of the world.
 
     Not thread-safe: it belongs to the perception thread.
     """
@@ -124,7 +124,7 @@ class RobotMemory:
             self._cells.hear(told)
 
     def tell(self, position: F64) -> SharedMap | None:
-        """What others may know of the surroundings of `position`; None if maps are not shared."""
+        """Shared map of the surroundings of `position`; None if maps are not shared."""
         return self._cells.tell(position) if self._cells else None
 
     def local_map(self, position: F64) -> F32:

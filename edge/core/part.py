@@ -1,4 +1,4 @@
-"""What code of another package raises, or gives, in one line that its author can act on."""
+"""Errors and results of code of another package, in one line that its author can act on."""
 
 import traceback
 
@@ -10,7 +10,7 @@ class PartError(ValueError):
 
 
 def in_one_line(error: Exception) -> str:
-    """What was raised, and the line of the package's own code that led to it.
+    """Describe what was raised, and the line of the package's own code that led to it.
 
     A PartError has its text already.
     """

@@ -1,4 +1,4 @@
-"""What a robot perceives, in which sizes, and where that is in the world.
+"""A robot's perception: its sizes, and where each window is in the world.
 
 All maps are indexed [x, y]; one cell is one model unit; positions are in model units.
 """
@@ -50,7 +50,7 @@ class PerceptionParameters(Bounded):
 
     @property
     def unseen(self) -> float:
-        """What the local map has in the world's cells that were not seen."""
+        """Value of the local map in the world's cells that were not seen."""
         return math.nan if self.unseen_as_nan else self.unknown_importance
 
 
@@ -69,7 +69,7 @@ def clamp_to_world(positions: F64, world_size: int) -> F64:
 def part_in_world(
     corner: tuple[int, int], size: int, world_size: int
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """What a square window of `size` cells from `corner` on shares with the world.
+    """Overlap of the world with a square window of `size` cells from `corner` on.
 
     As a part of the world's raster and as a part of the window; empty, at the border, for a
     window outside the world.
@@ -81,7 +81,7 @@ def part_in_world(
 
 
 def overlap(start: int, size: int, world_size: int) -> tuple[slice, slice]:
-    """What `size` cells from `start` on share with 0 .. world_size: as part of that, and of them.
+    """Overlap of `size` cells from `start` on with 0 .. world_size: as part of that, and of them.
 
     Empty, at the border, if they share nothing.
     """

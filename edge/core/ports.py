@@ -10,7 +10,7 @@ from edge.core.vehicle import Action, Setpoint, VehicleState
 
 
 class Clock(Protocol):
-    """What time it is. Called from any thread."""
+    """Return the time. Called from any thread."""
 
     def monotonic_s(self) -> float:
         """Time that never jumps, s; by it all ages are told."""
@@ -37,7 +37,7 @@ class Sensor(Protocol):
 
 
 class Look(NamedTuple):
-    """What a camera saw: both (sensor_size, sensor_size), indexed and centred as `Sensor.view` is.
+    """A camera's view: both (sensor_size, sensor_size), indexed and centred as `Sensor.view` is.
 
     `importance` is finite, also where `seen` is False; there it is not used.
     """
@@ -51,7 +51,7 @@ class Camera(Protocol):
     """Looks at the ground from the robot's height, and says which part of it it saw."""
 
     def look(self, position: F64, height: float) -> Look | None:
-        """What it sees now, or None when there is no fresh reading.
+        """Return the newest view, or None when there is no fresh reading.
 
         Called from the perception thread alone.
 
@@ -67,7 +67,7 @@ SensorOver = Callable[[str, str], Sensor | Camera]
 
 
 class SensorSetting(NamedTuple):
-    """What a sensor is to show: views of `perception.sensor_size`, as the policy was trained.
+    """Requirements of a sensor: views of `perception.sensor_size`, as the policy was trained.
 
     `idf_truncation` (standard deviations) and `idf_norm` (the importance of the most important
     cell) are those of a world that is computed. `options` are what robot.toml says of the sensor.
@@ -177,7 +177,7 @@ class Recorder(Protocol):
 
 
 class VehicleSetting(NamedTuple):
-    """What robot.toml says of the vehicle."""
+    """The vehicle's settings in robot.toml."""
 
     url: str
     system_id: int

@@ -55,7 +55,7 @@ class PositionQuality(StrEnum):
 
 
 class PositionCause(StrEnum):
-    """What speaks against a position, the gravest first.
+    """Causes of distrust in a position, the gravest first.
 
     What a newer program says, and this one has no name for, is UNKNOWN.
     """
@@ -132,7 +132,7 @@ class PositionLimits(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class PositionJudgement:
-    """What the position is worth, since `since_s`; `cause` is what speaks against it now, or spoke.
+    """Trust in the position, since `since_s`; `cause` is what speaks against it now, or spoke.
 
     `value` is what was measured where the cause has a number. `contradicted_at_s` is when the
     receiver last contradicted itself: an estimator that believes it is led astray within seconds,
@@ -173,7 +173,7 @@ class _Finding(NamedTuple):
 def judge(
     before: PositionJudgement, vehicle: VehicleState, limits: PositionLimits, now_s: float
 ) -> PositionJudgement:
-    """What the position is worth now. To be called a few times a second."""
+    """Judge the position now. To be called a few times a second."""
     looked_from_s = before.looked_from_s
     if not now_s - before.looked_at_s <= _NOT_LOOKED_S:
         # Nobody knows what was in between: all counts from now on.

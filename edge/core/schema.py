@@ -114,7 +114,7 @@ def bounds_of(cls: Any) -> Mapping[str, Meta]:
 
 
 def in_words(meta: Meta) -> str:
-    """What a constraint allows, to follow "must be"."""
+    """Describe the values that a constraint allows, to follow "must be"."""
     if meta.description is not None:
         return meta.description
     least = None if meta.ge == -MAX_FLOAT else meta.ge
@@ -221,7 +221,7 @@ def _parse(hint: Any) -> _Parsed:
 
 
 def _parts(hint: Any, value: object, where: str) -> Iterator[tuple[Any, Any, str]]:
-    """What of a table or list has a type of its own: the type, the value, and where it is."""
+    """Typed parts of a table or list: the type, the value, and where it is."""
     kind = _parse(hint).kind
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if isinstance(value, Mapping):
@@ -240,7 +240,7 @@ def _parts(hint: Any, value: object, where: str) -> Iterator[tuple[Any, Any, str
 
 
 def _fault(hint: Any, value: Any, where: str) -> str | None:
-    """What is outside of its bounds in a value of the right type, as one line."""
+    """Describe, as one line, where a value of the right type is out of its bounds."""
     kind, metas, optional = _parse(hint)
     if value is None and optional:
         return None

@@ -1,4 +1,4 @@
-"""What robots tell each other of what they have seen: a coarse map around the one who tells.
+"""Maps that robots share: a coarse map of the surroundings of the robot that tells it.
 
 Its cells are squares of `PerceptionParameters.shared_map_cell` model units, from the world's corner
 on. A robot knows a cell once its sensor has shown all of it at once, or once it was told. What it
@@ -31,7 +31,7 @@ _LARGEST = _IMPORTANCE[_MOST_CODE]
 
 
 class SharedMap(NamedTuple):
-    """What a robot knows around it: `codes` (n, n), which nobody changes, from cell `corner` on."""
+    """A robot's known surroundings: `codes` (n, n), which nobody changes, from cell `corner` on."""
 
     corner: tuple[int, int]
     codes: Codes
@@ -60,7 +60,7 @@ def cell_means(view: F32, cell: int) -> F32:
 
 
 class SharedCells:
-    """What one robot knows that is told: a byte for each cell of the world.
+    """The part of a robot's knowledge that it tells others: a byte for each cell of the world.
 
     Not thread-safe: it belongs to the perception thread.
     """
@@ -103,7 +103,7 @@ class SharedCells:
         np.copyto(known, told.codes[there], where=known == 0)
 
     def tell(self, position: F64) -> SharedMap:
-        """What is known around `position` (2,), model units: as large as the local map."""
+        """Known surroundings of `position` (2,), model units: as large as the local map."""
         x, y = corner = window_corner(position / self._cell, self._told)
         codes = np.zeros((self._told, self._told), np.uint8)
         here, there = self._overlap(corner, codes.shape)
@@ -130,7 +130,7 @@ class SharedCells:
     def _overlap(
         self, corner: tuple[int, int], shape: tuple[int, ...]
     ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """What cells of that shape from `corner` on share with the world: there, and here."""
+        """Overlap of the world with cells of that shape from `corner` on: there, and here."""
         (in_world_x, in_x), (in_world_y, in_y) = (
             overlap(start, size, self._side) for start, size in zip(corner, shape, strict=True)
         )

@@ -1,4 +1,4 @@
-"""What the autopilot tells about the vehicle, and what it can be told; nothing of MAVLink.
+"""State and commands of a vehicle, as its autopilot has them; nothing of MAVLink.
 
 Local frame (see `frames`): x north, y east, z down, m, from the estimator's origin. Times are the
 robot's monotonic clock, s.
@@ -50,7 +50,7 @@ class Action(StrEnum):
 
 
 class ActionResult(NamedTuple):
-    """What became of a command; `text` says why it was refused, "" if it was accepted."""
+    """Outcome of a command; `text` says why it was refused, "" if it was accepted."""
 
     action: Action
     accepted: bool
@@ -94,7 +94,7 @@ class Gps:
 
 
 class EstimatorStatus(NamedTuple):
-    """What the autopilot's estimator says of itself.
+    """The autopilot's estimate of its own errors.
 
     `horizontal` is whether it vouches for a position and a velocity in the plane, `glitch` whether
     it rejects the GPS; heard at `at_s`.

@@ -219,7 +219,7 @@ def _from_steps(steps: npt.NDArray[np.float16], counts: npt.NDArray[np.int8]) ->
 
 
 def most_bytes(message_size: int, payload_type: PayloadType, shared_side: int = 0) -> int:
-    """What a message takes whose numbers cannot be compressed; see `decode` for the two sizes."""
+    """Size of a message whose numbers cannot be compressed; see `decode` for the two sizes."""
     map_bytes = _MAP.size + shared_side * shared_side if shared_side else 0
     return _HEADER_SIZE + _payload_size(message_size, payload_type) + map_bytes
 
@@ -354,7 +354,7 @@ def _wrong_size(body: memoryview, header: _Header) -> Rejection | None:
 
 
 def _unpacked(body: memoryview, header: _Header, shared_side: int) -> memoryview | Rejection:
-    """What was compressed, if it has the size of what the own robots send."""
+    """Decompress a body, unless it has another size than that of the own robots."""
     size = header.payload_size
     if header.kind & _WITH_MAP:
         size += _MAP.size + shared_side * shared_side

@@ -83,19 +83,19 @@ class FlightLogError(ValueError):
 
 
 class LogMetadata(Protocol):
-    """Who writes: a dataclass, whose fields stand as text at the start of every segment."""
+    """Metadata of a log's writer: a dataclass, as text at the start of every segment."""
 
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
     @property
     def log_name(self) -> str:
-        """What the segments are called before their numbers."""
+        """Name of the segments, before their numbers."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class FlightMetadata:
-    """Who flew what.
+    """Robot, program, policy and configuration of a log.
 
     `bundle_id` is in hexadecimal, `bundle_path` is where the robot found it, and `configuration` is
     the robot's configuration as JSON text.
@@ -110,7 +110,7 @@ class FlightMetadata:
 
     @property
     def log_name(self) -> str:
-        """What a robot's segments are called."""
+        """Name of a robot's segments."""
         return f"robot-{self.robot_id}"
 
 
@@ -349,7 +349,7 @@ class FlightLog:
 
 
 class Missing(NamedTuple):
-    """What a log does not hold: all between two messages, or before the first, or after the last.
+    """Gap in a log: all between two messages, or before the first, or after the last.
 
     `damaged` is False where the log just ends: its program was killed, lost its power, or writes.
     """
@@ -377,7 +377,7 @@ def warn(missing: Missing) -> None:
 
 
 def read_metadata(path: Path) -> FlightMetadata:
-    """Who flew what in that segment.
+    """Read the metadata of that segment.
 
     Raises FlightLogError if it is no MCAP file or was not written by a robot, OSError if it cannot
     be read.
@@ -482,7 +482,7 @@ def _message(data: bytes) -> dict[str, Any]:
 
 
 def _whole(path: Path, missing: Callable[[Missing], None]) -> Iterator[list[McapRecord]]:
-    """What is as it was written: our metadata, and the records of each chunk, by their checksums.
+    """Intact parts of a log: our metadata, and the records of each chunk, by their checksums.
 
     Other records tell only whether something is missing between them.
     """

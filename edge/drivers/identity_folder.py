@@ -55,7 +55,7 @@ class Identity:
     start_is_kept: bool = True
 
     def guard(self, clock_s: Callable[[], float]) -> SignedGuard:
-        """What the program speaks and hears through; `clock_s` is its monotonic clock."""
+        """The guard that the program speaks and hears through; `clock_s` is its monotonic clock."""
         return SignedGuard(self.membership, clock_s, self.revocations)
 
     def keep(self, guard: SignedGuard) -> None:

@@ -1,4 +1,4 @@
-"""What robots tell each other, once for all: datagrams to a multicast group.
+"""Multicast: datagrams by which a robot tells something to all others at once.
 
 On Wi-Fi the access point sends such a frame once, at its slow basic rate and without an
 acknowledgement: some are lost, which the policy takes, and ten times as many robots fit into a

@@ -1,4 +1,4 @@
-"""What only one program on a machine may hold."""
+"""Lock that only one program on a machine can hold."""
 
 import errno
 import socket

@@ -1,4 +1,4 @@
-"""What robot.toml and a bundle's manifest choose by name; installed packages can add to it.
+"""Drivers that robot.toml and a bundle's manifest choose by name; packages can add to them.
 
 A package adds a type by an entry point, named as the type, of the group of its kind:
 
@@ -84,7 +84,7 @@ def load_learnable(family: str) -> Any:
 def open_sensor(
     type_: str, options: Mapping[str, object], manifest: Manifest
 ) -> AbstractContextManager[SensorOver]:
-    """What [sensor] says, for a policy that can fly. Raises ConfigError for an unknown type."""
+    """Open the sensor of [sensor], for a policy that can fly. Raises ConfigError."""
     assert manifest.perception is not None  # without it no policy is loaded
     driver: SensorDriver = _load(_SENSORS, type_, "sensor: type")
     training = manifest.training
@@ -97,13 +97,13 @@ def open_sensor(
 
 
 def open_vehicle(type_: str, setting: VehicleSetting) -> AbstractContextManager[OpenVehicle]:
-    """What [autopilot] says. Raises ConfigError for an unknown type."""
+    """Open the vehicle of [autopilot]. Raises ConfigError for an unknown type."""
     driver: VehicleDriver = _load(_VEHICLES, type_, "autopilot: type")
     return _opened(_VEHICLES, type_, "autopilot: type", partial(driver, setting), _vehicle)
 
 
 def open_link(type_: str, setting: LinkSetting) -> AbstractContextManager[Link]:
-    """What [link] says. Raises ConfigError for an unknown type."""
+    """Open the link of [link]. Raises ConfigError for an unknown type."""
     driver: LinkDriver = _load(_LINKS, type_, "link: type")
     return _opened(_LINKS, type_, "link: type", partial(driver, setting), _link)
 

@@ -346,7 +346,7 @@ class ZenohLink:
 
 
 class ZenohRouter:
-    """What clients meet at: it passes on what they say, and says nothing itself.
+    """Router that clients meet at: it passes on what they say, and says nothing itself.
 
     Close it, or use it as a context manager.
     """
@@ -478,7 +478,7 @@ def _tls(prefix: str, mode: str, tls: TlsFiles) -> dict[str, object]:
 
 
 def _access_control(prefix: str) -> dict[str, object]:
-    """Who says what below the prefix, by the common names of certificates; all hear all."""
+    """Access rules below the prefix: publishers by their certificates' names; all hear all."""
     may_say = {
         "operator": [f"{prefix}ground/**"],
         "observer": [f"{prefix}ground/{topic.name}" for topic in (STATE, GROUND_CARD)],

@@ -1,4 +1,4 @@
-"""What the operator must see of a robot in flight, the gravest first.
+"""Alarms of a robot in flight, for its operator, the gravest first.
 
 Each condition gives the text of its alarm, or None; the table of transitions and the orders ask
 some of them, too.
@@ -157,7 +157,7 @@ _IN_FLIGHT = {**ALARMS, **_LINK_ALARMS}
 
 
 def alarms(t: Tick) -> tuple[Reason, ...]:
-    """What the operator must see, the gravest first, each thing once."""
+    """Present alarms, the gravest first, each thing once."""
     found = [t.flight.reason] if t.flight.alarming else []
     in_flight = t.flight.state in (*AIRBORNE, FlightState.PILOT)
     conditions = _IN_FLIGHT if in_flight else _LINK_ALARMS

@@ -33,7 +33,7 @@ _UpToAnHour = Annotated[float, Meta(ge=0.0, le=3600.0)]
 
 @dataclass(frozen=True, slots=True)
 class EnergyParameters(Bounded):
-    """What a pack is worth; times in s.
+    """Endurance of a pack; times in s.
 
     `endurance_s` is a flight with a full pack until it is empty, for as long as none was measured.
     `cells` in series, 0 if not known: then `low_cell_v`, V per cell under load, is not looked at.
@@ -51,7 +51,7 @@ class EnergyParameters(Bounded):
 
 
 class Energy(NamedTuple):
-    """What is left, and what is needed.
+    """Flight time that is left, and that is needed.
 
     `lasts_s` is how long the robot flies until its battery is critical, by this flight's drain.
     `home_s` is what it takes from here until the vehicle has landed, with the wait before and the
@@ -76,7 +76,7 @@ class Energy(NamedTuple):
 
 
 class Consumption:
-    """What the battery gives, flight by flight. For one thread."""
+    """Estimator of the battery's endurance, flight by flight. For one thread."""
 
     def __init__(self, parameters: EnergyParameters) -> None:
         self._parameters = parameters
@@ -93,7 +93,7 @@ class Consumption:
     def hear(
         self, now_s: float, armed: bool | None, share: float | None, voltage_v: float | None
     ) -> None:
-        """What the autopilot says now of the battery: its remaining share, and its voltage."""
+        """Take the autopilot's reading of the battery: its remaining share, and its voltage."""
         self._recent.append((now_s, share, voltage_v))
         while now_s - self._recent[0][0] > _MEDIAN_S:
             self._recent.popleft()

@@ -88,7 +88,7 @@ _OVERRIDE = {
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """What one parameter must be: one of `values`, or above `above` and up to `up_to`.
+    """Requirement of one parameter: one of `values`, or above `above` and up to `up_to`.
 
     `value_to_set` is what to set it to, of the parameter's own type (int or float), and None if it
     must be set by hand, since it counts after a reboot only. `means` says what PX4 does at a value.
@@ -109,7 +109,7 @@ class Requirement:
         return value in self.values or self.above < value <= self.up_to * (1.0 + _ROUNDING)
 
     def wanted(self) -> str:
-        """What is allowed, in words."""
+        """Describe the values that are allowed."""
         options = [self._in_words(value) for value in self.values]
         if self.above < math.inf:
             up_to = f" and up to {self.up_to:g}" if self.up_to < math.inf else ""
@@ -117,7 +117,7 @@ class Requirement:
         return " or ".join(options)
 
     def problem(self, value: float | None) -> str | None:
-        """What is wrong with the vehicle's value, None where nothing is."""
+        """Describe the fault of the vehicle's value, None where there is none."""
         if value is None:
             if self.may_be_absent:
                 return None
@@ -134,7 +134,7 @@ class Requirement:
 def required(
     rc: RemoteControl, ceiling_m: float, command_timeout_s: float = 0.5
 ) -> tuple[Requirement, ...]:
-    """What the vehicle's parameters must be.
+    """Requirements of the vehicle's parameters.
 
     `rc` "pilot": somebody holds a remote control and may take the vehicle at any time; "none":
     there is none, and PX4 must not wait for one. `ceiling_m` is the fence's. `command_timeout_s` is
@@ -373,7 +373,7 @@ PARAMETERS = tuple(requirement.name for requirement in required("pilot", ceiling
 
 
 def check(requirements: tuple[Requirement, ...], parameters: Parameters) -> tuple[str, ...]:
-    """What is wrong with the vehicle's parameters, one plain line each; empty if nothing is.
+    """Describe each fault of the vehicle's parameters in one plain line; empty if there is none.
 
     A parameter that is missing from `parameters`, or None there, is not known.
     """
@@ -398,7 +398,7 @@ def check(requirements: tuple[Requirement, ...], parameters: Parameters) -> tupl
 
 
 def explain(parameters: Parameters) -> tuple[str, ...]:
-    """What this vehicle will do when something fails, from its own parameters, one line each."""
+    """Say what this vehicle will do when something fails, by its parameters, one line each."""
     look_up = _LookUp(parameters)
     return (
         f"if this program dies, PX4 will: {_on_program_loss(look_up)}",

@@ -71,7 +71,7 @@ class Parted(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guidance:
-    """What guidance remembers: the last commanded velocity (3,), a recovery to the fence, and where
+    """Memory of guidance: the last commanded velocity (3,), a recovery to the fence, and where
     HOLD has parted to."""
 
     velocity_m_s: F64 = field(default_factory=lambda: np.zeros(3))

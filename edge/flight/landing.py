@@ -60,7 +60,7 @@ def standing_robots(beacons: Iterable[Beacon]) -> list[StandingRobot]:
 def may_stand(
     silent: Neighbour, its_landing_point_m: Point, limits: SilenceLimits
 ) -> list[StandingRobot]:
-    """Who fell silent in flight, as if it had landed on its way, everywhere that may lead.
+    """Places where a robot that fell silent in flight may stand, as if it had landed on its way.
 
     It is down some time, unheard.
     """
@@ -74,7 +74,7 @@ def may_stand(
 def in_the_way(
     landing_point_m: Point, standing: Iterable[StandingRobot], errors: ErrorBudget
 ) -> list[tuple[StandingRobot, float]]:
-    """Who stands where that landing point is, though not on its own; and how far from it, m."""
+    """Robots that stand at that landing point, which is not their own; and how far from it, m."""
     apart = places_apart(errors.position_m, errors.position_m)
     away = [(each, each.away_m(landing_point_m)) for each in standing]
     return [(each, m) for each, m in away if not each.is_on_its_own and not apart.holds(m)]

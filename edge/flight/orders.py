@@ -1,4 +1,4 @@
-"""What the operator's orders ask for: where each is taken, and why it is refused.
+"""The operator's orders: where each is taken, and why it is refused.
 
 `ORDERS` says it of each kind; docs/safety.md shows the same table to people.
 """

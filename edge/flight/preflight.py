@@ -45,7 +45,7 @@ class PreflightLimits(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class PreflightInputs:
-    """What the checks look at.
+    """Inputs of the checks.
 
     `bundle_problem` is why the bundle was not verified on this CPU, None if it was.
     `system_id` is the configured one. `position` is what the position is worth; `position_m` (3,)

@@ -1,4 +1,4 @@
-"""What no ground can widen, whatever it sets: how far and how high a robot may be sent at most."""
+"""Limits that no ground can widen: how far and how high a robot may be sent at most."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ class Reach(Bounded):
     ceiling_m: Positive = 120.0
 
     def origin_beyond(self, place_m: Sequence[float] | None) -> FailedCheck | None:
-        """What is wrong with a mission origin that a robot at this place (x, y) of it has.
+        """Describe the fault of a mission origin for a robot at this place (x, y) of it.
 
         Nothing, as far as is known, if the place is not.
         """

@@ -1,4 +1,4 @@
-"""What a control tick was given and what it made of it, as the flight log holds it.
+"""Inputs and results of a control tick, as the flight log holds them.
 
 A message holds what is not as in the one before, exactly; every hundredth holds everything, so that
 a log can be read from the middle. The memory that a tick is given is mostly what the last one made.
@@ -36,7 +36,7 @@ class Given:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Made:
-    """What comes of it. The setpoint is one of the two, in the mission frame, or None."""
+    """Result of a tick. The setpoint is one of the two, in the mission frame, or None."""
 
     flight: FlightMemory
     actions: tuple[Action, ...]
@@ -48,7 +48,7 @@ class Made:
 
 
 def made(decision: Decision, setpoint: MissionSetpoint | None, guidance: Guidance) -> Made:
-    """What `step` and `guide` returned."""
+    """Record what `step` and `guide` returned."""
     return Made(
         flight=decision.flight,
         actions=decision.actions,
@@ -112,10 +112,10 @@ class TickReader:
 
 
 def _left(last: FlightTick) -> Given:
-    """What the next tick is given if nothing changes."""
+    """Given to the next tick if nothing changes."""
     return replace(last.given, flight=last.made.flight, guidance=last.made.guidance)
 
 
 def _begun(last: FlightTick, given: Given) -> Made:
-    """What this tick makes if nothing changes."""
+    """Made of this tick if nothing changes."""
     return replace(last.made, flight=given.flight, guidance=given.guidance)

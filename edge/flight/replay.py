@@ -34,7 +34,7 @@ class Differing(NamedTuple):
 
 @dataclass(slots=True)
 class FlightDifference:
-    """What differs in `ticks` ticks in a row, as it was in the first of them."""
+    """Difference in `ticks` ticks in a row, as it was in the first of them."""
 
     since_unix_s: float
     until_unix_s: float
@@ -81,7 +81,7 @@ class FlightReplay:
 
 
 def differing(tick: FlightTick) -> Iterator[Differing]:
-    """What of a tick differs now; nothing if all is the same bit by bit."""
+    """Differences of a tick now; none if all is the same bit by bit."""
     then, now = tick.made, run_again(tick.given)
     for what, one, other in (
         ("state", then.flight.state, now.flight.state),

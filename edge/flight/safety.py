@@ -79,7 +79,7 @@ class Closest(NamedTuple):
 
 
 def nearest(position_m: Sequence[float], neighbours: Iterable[Neighbour]) -> Closest | None:
-    """Who is nearest by 3-D distance, each taken to have flown on as it did; None if nobody is.
+    """Find the nearest robot, in 3-D, each taken to have flown on as it did; None if there is none.
 
     Neighbours of which something is not known are left out.
     """
@@ -172,7 +172,7 @@ def keep_inside(
     limits: MotionLimits,
     recovering: bool,
 ) -> tuple[F64, bool]:
-    """What may be flown of `wanted_m_s`, so that the vehicle stops at the buffer inside the line.
+    """Limit `wanted_m_s` so that the vehicle stops at the buffer inside the line.
 
     `velocity_m_s` is the vehicle's own, as estimated: for its lag it moves on, whatever is told.
     Towards each edge the velocity is shortened, along it not. A vehicle that was carried outside is
@@ -209,7 +209,7 @@ def brake(
     limits: MotionLimits,
     fence: Fence | None,
 ) -> F64:
-    """What may be flown of `wanted_m_s`, so that the robot stays as far from others as it must.
+    """Limit `wanted_m_s` so that the robot stays as far from others as it must.
 
     `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
     did. One that is `level_m` or more above or below brakes nothing, since robots cross in their
@@ -247,7 +247,7 @@ def make_room(
     *,
     lands: bool,
 ) -> F64:
-    """What who holds its place flies of `wanted_m_s`: as `brake`, but it looks at less.
+    """Limit `wanted_m_s` of a robot that holds its place: as `brake`, but it looks at less.
 
     Neighbours of which something is not known do not keep it from its place; nor do those who are
     silent, who may not hear it either, and take it to stand there. Who is to come down where it is,
@@ -269,7 +269,7 @@ def make_room(
 
 
 class _Near(NamedTuple):
-    """Who limits the robot: its place from here, (2,), or from where the vehicle comes to rest.
+    """A robot that limits this one: its place from here, (2,), or from where the vehicle stops.
 
     `slack_m` may be flown towards it, below 0 away from it; and no more than `at_most_m`, 0 or
     more, if others have to be left more than this one.
@@ -335,7 +335,7 @@ def _kept_apart(
     limits: MotionLimits,
     fence: Fence | None,
 ) -> F64:
-    """What may be flown of `wanted_m_s` towards, and away from, all who are near."""
+    """Limit `wanted_m_s` towards, and away from, all robots that are near."""
     if not all(each.offset_m.any() for each in near):
         return np.zeros(3)  # One is just here: every way may be the wrong one.
     ways = []

@@ -1,4 +1,4 @@
-"""Who fell silent in flight, and where it may be by now. Mission frame, m and s; pure.
+"""Robots that fell silent in flight, and where they may be by now. Mission frame, m and s; pure.
 
 Nobody knows whether it flies on, hovers or comes down: its program may have died, its radio, or its
 position.
@@ -24,7 +24,7 @@ _CLIMBS = (FlightState.ARMING, FlightState.TAKEOFF, FlightState.RETURN)
 
 
 class SilenceLimits(NamedTuple):
-    """What a robot that fell silent in flight may do, as long as nobody else flies it.
+    """Limits of a robot that fell silent in flight, as long as nobody else flies it.
 
     It is no faster than `max_speed_m_s` and no higher than `ceiling_m`, whatever it told. It flies
     on for at most `flies_on_s`, and comes down at any time, but after at most `hovers_s`.

@@ -1,4 +1,4 @@
-"""What one robot's flight state machine knows: its parameters, memory, a tick's inputs.
+"""The flight state machine of one robot: its parameters, memory, and a tick's inputs.
 
 `Tick` is all of that together, with what follows from it; the table of transitions, the orders and
 the alarms ask nothing else. Nothing here has a clock or talks to a vehicle.
@@ -66,7 +66,7 @@ class Px4Change(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FlightParameters(Bounded):
-    """What one robot's flight is measured by; times in s, distances in m, speeds in m/s.
+    """Parameters of one robot's flight; times in s, distances in m, speeds in m/s.
 
     The robot flies at `base_height_m + slot * slot_spacing_m`: the policy is planar and GPS errs by
     metres, so that each robot has a height of its own. `landing_point_m` (x, y) is in the mission
@@ -108,7 +108,7 @@ class FlightParameters(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class FlightMemory:
-    """What the machine remembers from tick to tick.
+    """Memory of the machine from tick to tick.
 
     `target_m` is what TAKEOFF and HOLD keep: x and y of the mission frame, and a height.
     `reached`: since the state was entered the vehicle was seen as the state needs it: in offboard,
@@ -155,7 +155,7 @@ class FlightMemory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlightInputs:
-    """What one control tick knows.
+    """Inputs of one control tick.
 
     `position` is what the position is worth. `odometry` is in the mission frame, its z the altitude
     above sea level, less what that jumped in flight; None when the position is lost or old, or
@@ -195,7 +195,7 @@ class FlightInputs:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """Who flies: what does not change during a flight.
+    """The robot that flies: what does not change during a flight.
 
     `on_remote_control_lost`: what a lost remote control does in flight; None if there is none.
 
@@ -263,7 +263,7 @@ class Robot:
 
     @property
     def silence(self) -> SilenceLimits:
-        """What one of the others may do that fell silent."""
+        """Limits of another robot that fell silent."""
         p, limits = self.parameters, self.limits
         # By where it flies after that, at its greatest speed, when it is to hold.
         stops_s = stopping_m(limits.max_speed_m_s, limits) / limits.max_speed_m_s

@@ -242,7 +242,7 @@ def _target_m(t: Tick) -> Vector | None:
 
 
 def _ask(t: Tick) -> tuple[Action, ...]:
-    """What the state needs from the autopilot, asked again until it is so; ARM is asked once."""
+    """Commands that the state needs from the autopilot, until it is so; ARM is asked once."""
     flight, now_s = t.flight, t.inputs.now_s
     streamed = t.could_follow_s >= _STREAM_S
     if flight.state is _S.LAND:

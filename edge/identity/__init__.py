@@ -1,1 +1,1 @@
-"""Who speaks on the radio: cards, signed envelopes, and what is not a member's is not heard."""
+"""Identity on the radio: cards, signed envelopes, and refusal of what is not a member's."""

@@ -1,4 +1,4 @@
-"""What the fleet's authority signs: who is a member, and whose key is not good any more.
+"""Cards and revocations, which the fleet's authority signs: members, and keys no longer good.
 
 A signed document is 64 bytes of Ed25519 signature and behind them JSON. The signature is over the
 document's kind, so that none passes for another, and the JSON.
@@ -65,7 +65,7 @@ class Card:
 
     @property
     def member(self) -> tuple[Role, str]:
-        """Whom it stands for."""
+        """Member that the card stands for."""
         return self.role, self.name if self.robot_id is None else str(self.robot_id)
 
 

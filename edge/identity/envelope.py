@@ -1,4 +1,4 @@
-"""What every message travels in: who says it, and the signature of its sender.
+"""Envelope of every message: its sender, and the sender's signature.
 
 Little-endian, 21 bytes before the payload and 64 behind it:
 
@@ -28,7 +28,7 @@ OVERHEAD_BYTES = _FIELDS.size + SIGNATURE_BYTES
 
 
 class Address(NamedTuple):
-    """What a message is for: the fleet, by its authority's public key, and the key expression.
+    """Context of a message: the fleet, by its authority's public key, and the key expression.
 
     `key` is the part below `lpac/<fleet>/`, such as robot/3/status.
     """
@@ -37,7 +37,7 @@ class Address(NamedTuple):
     key: str
 
     def signed_text(self, sealed: bytes) -> bytes:
-        """What the signature of a message for it is over."""
+        """Bytes that the signature of a message covers."""
         return b"".join((b"lpac envelope 1\0", self.authority, self.key.encode(), b"\0", sealed))
 
 
@@ -51,7 +51,7 @@ class Envelope(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """What it says."""
+        """The payload."""
         return self.data[_FIELDS.size : -SIGNATURE_BYTES]
 
     def is_from(self, public_key: bytes, address: Address) -> bool:

@@ -1,4 +1,4 @@
-"""What goes to all robots at once: one datagram, or up to three, sealed with the fleet's group key.
+"""Messages to all robots at once: one datagram, or up to three, sealed with the fleet's group key.
 
 Who is not a member reads none of it, and nothing of his is listened to. Who said it is for the
 envelope inside to tell (`edge.identity.envelope`): any member has the key.
@@ -82,12 +82,12 @@ class GroupKey(NamedTuple):
 
 
 def key_of_open_fleet(fleet: str) -> bytes:
-    """What a fleet without keys takes for one: it keeps fleets apart, and nothing secret."""
+    """Group key of a fleet without keys: it keeps fleets apart, and nothing secret."""
     return hashlib.sha256(f"lpac open fleet {fleet}".encode()).digest()
 
 
 def number_in(message: bytes) -> MessageNumber | None:
-    """What the envelope says; None if the message has none."""
+    """Number in the message's envelope; None if the message has none."""
     envelope = read_envelope(message)
     return None if envelope is None else MessageNumber(envelope.start, envelope.sequence)
 
@@ -155,7 +155,7 @@ _Pieces = tuple[MessageNumber, int, int]
 
 @dataclass(slots=True)
 class _Sender:
-    """What came of one sender's messages on one topic; `key` is the newest that it spoke with."""
+    """Parts of one sender's messages on one topic; `key` is the newest that it spoke with."""
 
     newest: Newest = field(default_factory=Newest)
     newest_at_s: float = -math.inf

@@ -43,7 +43,7 @@ _MOST_AHEAD_MS = 24 * 3600e3
 
 
 class Speaker(NamedTuple):
-    """Who said a message: `name` is its card's, "" where messages are not signed."""
+    """Sender of a message: `name` is its card's, "" where messages are not signed."""
 
     role: Role
     name: str
@@ -67,7 +67,7 @@ class RefusedMessage(StrEnum):
 
 @dataclass(slots=True)
 class _Heard:
-    """What a member says on one key; all times are a monotonic clock's, s."""
+    """State of one member on one key; all times are a monotonic clock's, s."""
 
     newest: Newest = field(default_factory=Newest)
     newest_s: float = -math.inf
@@ -112,23 +112,23 @@ class CardProblem(StrEnum):
 
 
 class Guard(Protocol):
-    """What a node speaks and hears through."""
+    """Interface through which a node speaks and hears."""
 
     @property
     def role(self) -> Role | None:
-        """What it speaks as; None where nobody's word is signed."""
+        """Role that it speaks in; None where messages are not signed."""
 
     def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
-        """What the link is to be opened with, so that the node hears those topics."""
+        """Callbacks to open the link with, so that the node hears these topics."""
 
     def over(self, link: Link) -> Link:
-        """What the node says goes there, and so to the link."""
+        """Link for the node to publish on, which passes on to this one."""
 
     def introduce(self) -> None:
         """Show others who this is, if it is time; for a node that may have nothing to say."""
 
     def card_problem(self, unix_s: float) -> CardProblem | None:
-        """What is wrong with this member's own card at that time; None: nothing."""
+        """Describe the fault of this member's own card at that time; None: there is none."""
 
     def revoked_robots(self) -> frozenset[int]:
         """Robots that are listened to no more, and may still fly."""
@@ -209,7 +209,7 @@ class Membership:
 
     @property
     def card(self) -> Card:
-        """Who it is. Raises CardError if the card is another key's, or not this authority's."""
+        """Identify a sender. Raises CardError if its card is of another key or authority."""
         card = verified(Card, self.card_data, self.authority)
         if card.public_key != self.signer.public_key:
             raise CardError(f"the card of {card.name} is for another key than the one beside it")

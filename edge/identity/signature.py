@@ -39,7 +39,7 @@ def is_signed(message: bytes, signature: bytes, public_key: bytes) -> bool:
 
 
 def fingerprint(public_key: bytes) -> bytes:
-    """What a key is called: the first 8 bytes of its SHA-256.
+    """Fingerprint of a key: the first 8 bytes of its SHA-256.
 
     Long enough that nobody finds a second key of the same name among a fleet's; what a message is
     worth is decided by the whole key.

@@ -1,1 +1,1 @@
-"""What robots and ground say to each other."""
+"""Messages between robots and ground."""

@@ -17,7 +17,7 @@ _SWEPT_EVERY_S = 1.0
 
 
 class _Heard:
-    """What a key may still say, in messages, and when that was."""
+    """Budget of a key: the messages that it may still send, and when that was."""
 
     __slots__ = ("at_s", "left")
 

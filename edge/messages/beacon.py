@@ -1,4 +1,4 @@
-"""What a robot tells its neighbours besides its policy's message: 64 bytes.
+"""Beacon: what a robot tells its neighbours besides its policy's message, in 64 bytes.
 
 A robot's message is a beacon, and behind it what its policy says (see `edge.core.wire`); while the
 policy is silent, the beacon alone. So neighbours keep apart, and compare themselves before a
@@ -54,7 +54,7 @@ _UNKNOWN = 65_535
 
 @dataclass(frozen=True, slots=True)
 class Beacon:
-    """What a robot says of itself; positions as in `RobotStatus`, to 1 cm, heights to 1 mm.
+    """A robot's own state; positions as in `RobotStatus`, to 1 cm, heights to 1 mm.
 
     `bundle_tag` and `world_tag` are the `tag`s of what it flies by; `frame_id` is 0 as long as it
     has no mission origin.

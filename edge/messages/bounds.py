@@ -1,4 +1,4 @@
-"""What numbers, texts and lists in a message may be: decoding refuses everything else.
+"""Bounds of numbers, texts and lists in messages: decoding refuses everything else.
 
 The bounds are far outside of what a fleet needs, and inside of what costs or breaks anything.
 """

@@ -38,7 +38,7 @@ _decoders: dict[type, "msgspec.json.Decoder[Any]"] = {}
 
 
 class MessageError(ValueError):
-    """What came is not understood; one line says why."""
+    """A message that is not understood; one line says why."""
 
 
 def encode(message: object) -> bytes:

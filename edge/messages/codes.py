@@ -21,7 +21,7 @@ class _Code(StrEnum):
 
 
 class CheckCode(_Code):
-    """What keeps a robot on the ground."""
+    """Checks that keep a robot on the ground."""
 
     OTHER = "other"
     CHECKS_RUNNING = "checks_running"
@@ -118,7 +118,7 @@ class FailedCheck:
 
 
 class ReasonCode(_Code):
-    """What leads a robot from one state to another, or alarms its operator."""
+    """Reasons for a robot's change of state, and for alarms."""
 
     OTHER = "other"
     PROGRAM_STARTED = "program_started"

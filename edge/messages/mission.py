@@ -1,4 +1,4 @@
-"""What the ground and the robots say to each other.
+"""Messages between the ground and the robots.
 
 Two kinds of message go to the robots. `GroundState` is published again and again, so that nothing
 depends on one packet; what it says can only hold, return or land a robot. An `Order` happens once:
@@ -131,7 +131,7 @@ class Echo:
 
 @dataclass(frozen=True, slots=True)
 class GroundState:
-    """What the ground wants for as long as it says so; `sequence` grows with every change.
+    """The ground's wishes for as long as it repeats them; `sequence` grows with every change.
 
     `operator` is who commands; of two states with one sequence the greater operator's counts.
     `enabled` lets robots run their preflight checks. `safety_action` asks the fleet to hold, to
@@ -173,7 +173,7 @@ class GroundState:
         return self.robot_enabled.get(str(robot_id), self.enabled)
 
     def safety_action_for(self, robot_id: int) -> SafetyAction:
-        """What is asked of one robot."""
+        """Safety action that is asked of one robot."""
         return self.robot_safety_actions.get(str(robot_id), self.safety_action)
 
 
@@ -258,7 +258,7 @@ class LoopStatus:
 
 @dataclass(frozen=True, slots=True)
 class RadioCounts:
-    """What a robot and its neighbours said to each other since the start of its program.
+    """Counts of messages between a robot and its neighbours since the start of its program.
 
     `sent` is how many messages its policy had for them, `sent_bytes` what these had together,
     without envelopes. `arrivals` is what came of each, also too late: `Arrivals.counts`, by robot.
@@ -271,7 +271,7 @@ class RadioCounts:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """What a robot says of itself, a few times a second.
+    """A robot's report of itself, a few times a second.
 
     `ready` means that a takeoff order would be taken; else `failed_checks` says why not. Positions
     are in the mission frame, heights above the robot's own takeoff point, m. `obeyed_sequence` is
@@ -382,7 +382,7 @@ def is_too_low(status: RobotStatus) -> bool:
 
 
 def waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int]) -> set[int]:
-    """Who of those that `arrived` over their landing points must not land yet; robot ids.
+    """Ids of those that `arrived` over their landing points and must not land yet.
 
     Landing leads through the heights of all lower robots: somebody still flies home there.
     """
@@ -398,7 +398,7 @@ def waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int
 
 
 def world_id(text: str) -> str:
-    """What a world file is called: the first 12 hexadecimal digits of its sha256."""
+    """Name of a world file: the first 12 hexadecimal digits of its sha256."""
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -1,4 +1,4 @@
-"""What travels by radio: the one table of topics.
+"""Radio traffic: the one table of topics.
 
 A topic's key is `lpac/<fleet>/robot/<id>/<name>` or `lpac/<fleet>/ground/<name>`. The link takes
 who sends what, sizes and priorities from here, and drops what is larger.
@@ -125,7 +125,7 @@ class Group(NamedTuple):
 
 
 class LinkSetting(NamedTuple):
-    """What robot.toml says of the radio: see `edge.robot.config.LinkConfig`.
+    """The radio's settings in robot.toml: see `edge.robot.config.LinkConfig`.
 
     With `robot_id` None it only listens. `subscriptions` maps topics to callbacks, which are called
     from any thread with the key below `lpac/<fleet>/`, such as robot/3/message, and the data; they

@@ -1,4 +1,4 @@
-"""What a kind of policy has to offer so that robots can fly it.
+"""Interface of a policy family, so that robots can fly its policies.
 
 A bundle's manifest names its family. The family makes a `Policy` of the bundle, which all robots of
 a program share; that gives each robot an `Agent`. `edge.policy.lpac` is the family of the paper.
@@ -32,7 +32,7 @@ class GoldenCheck:
 
 
 class Observation(NamedTuple):
-    """What a robot knows when it perceives; model units, arrays valid until the next one.
+    """A robot's knowledge when it perceives; model units, arrays valid until the next one.
 
     `position` (2,) is the robot's, or the nearest point of the world to it. `local_map`
     (local_map_size, local_map_size), indexed [x, y], is the importance around it as far as it was
@@ -49,7 +49,7 @@ class Observation(NamedTuple):
 
 
 class Perceived(NamedTuple):
-    """What an agent makes of an observation.
+    """An agent's result from an observation.
 
     `features` is a new array, of what shape is the agent's matter; `inputs` is what it was computed
     from, by name, which the flight log keeps.
@@ -60,7 +60,7 @@ class Perceived(NamedTuple):
 
 
 class PolicyStep(NamedTuple):
-    """What an agent does next: new arrays.
+    """An agent's next action and message: new arrays.
 
     `velocity` (2,) is in model units/s, `payload` (message_size,) what its neighbours are told.
     """
@@ -150,7 +150,7 @@ class VerifiedPolicy:
 
 
 def golden_checks(policy: Policy) -> Iterator[GoldenCheck]:
-    """What its `verify` finds. Raises BundleError, also for whatever else that raises."""
+    """Run the policy's `verify`. Raises BundleError, also for whatever else that raises."""
     try:
         yield from policy.verify()
     except BundleError:

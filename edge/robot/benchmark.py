@@ -27,7 +27,7 @@ _MOST_NEIGHBOURS = 1000
 
 @dataclass(frozen=True, slots=True)
 class StepTimes:
-    """What one step took, over all its calls, and the period that it has in flight; ms."""
+    """Times of one step, over all its calls, and the period that it has in flight; ms."""
 
     step: str
     calls: int
@@ -49,7 +49,7 @@ class StepTimes:
 
 @dataclass(frozen=True, slots=True)
 class Benchmark:
-    """What was measured, and on which architecture: "aarch64", "x86_64"."""
+    """Measured times, and the architecture: "aarch64", "x86_64"."""
 
     architecture: str
     neighbours: int
@@ -122,7 +122,7 @@ class _Flight:
         return Odometry((quarter * x, quarter * y, 4.0), (0.0, 0.0, 0.0))
 
     def tick(self) -> tuple[float, float]:
-        """What `Pac.perceive` and `Pac.infer` took, s."""
+        """Times of `Pac.perceive` and `Pac.infer`, s."""
         self._ticks += 1
         now_s = float(self._ticks)
         self._receive(now_s)

@@ -87,7 +87,7 @@ def require_group(key: str, group: str) -> tuple[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
-    """What looks at the ground: a `type` of `edge.drivers.registry`, and what that takes."""
+    """Sensor of the ground: a `type` of `edge.drivers.registry`, and what that takes."""
 
     type: str = "world"
     options: dict[str, object] = field(default_factory=dict, hash=False)
@@ -211,7 +211,7 @@ class PolicyConfig(Bounded):
     payload: Literal["smallest", PayloadType] = "smallest"
 
     def payload_of(self, judged: Sequence[PayloadType]) -> PayloadType:
-        """What messages are encoded as, of what the policy was `judged` with.
+        """Encoding of messages, of those that the policy was `judged` with.
 
         Raises ConfigError if it was not judged with the one that is asked for.
         """
@@ -227,7 +227,7 @@ class PolicyConfig(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class FailsafeConfig(Bounded):
-    """What PX4 does when something fails: for an RC pilot, or for none.
+    """PX4's reactions when something fails: for an RC pilot, or for none.
 
     `parameters`: whether wrong PX4 parameters are set, also in flight if somebody else changes
     them, or arming is refused.
@@ -305,7 +305,7 @@ class RobotConfig(Bounded):
                     raise ValueError(f"link: {name} = {endpoint!r}: must be {must}")
 
     def robot(self, boot_nonce: int) -> Robot:
-        """Who flies, in this start of its program."""
+        """The robot that flies, in this start of its program."""
         return Robot(
             self.robot_id,
             boot_nonce,
@@ -324,7 +324,7 @@ class RobotConfig(Bounded):
         return self.errors.free_ground(self.limits, beyond_m, ceiling_m)
 
     def pac(self, judged: Sequence[PayloadType]) -> PacParameters:
-        """What the perception-action-communication loop takes; see `PolicyConfig.payload_of`."""
+        """Parameters of the perception-action-communication loop; see `PolicyConfig.payload_of`."""
         policy = self.policy
         return PacParameters(
             scale=ModelScale(policy.env_scale, policy.velocity_scale),

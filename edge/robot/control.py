@@ -241,7 +241,7 @@ class FlightControl:
         return self._consumption.endurance_s
 
     def failed_checks(self, now_s: float) -> tuple[FailedCheck, ...] | None:
-        """What keeps the robot on the ground; None if nobody looked lately. From any thread."""
+        """Failed checks; None if nobody looked lately. From any thread."""
         checks = self.checks
         if checks is None or now_s - checks.at_s > _MAX_CHECKS_AGE_S:
             return None
@@ -251,7 +251,7 @@ class FlightControl:
         return (*checks.failed, *self.not_taken)
 
     def leave(self, on_stop: Action) -> Action | None:
-        """What the program that ends asks of the vehicle it was flying; None if it was not.
+        """Request to the vehicle that it was flying when the program ends; None if it was not.
 
         Once the control loop has ended. Nothing is taken from a pilot, or from PX4's failsafe.
         """
@@ -359,7 +359,7 @@ class FlightControl:
         )
 
     def _neighbours(self, peers: tuple[HeardBeacon, ...], now_s: float) -> tuple[Neighbour, ...]:
-        """Whom to keep away from: also robots that are silent since their policy or sensor failed.
+        """Robots to keep away from: also those that are silent since their policy or sensor failed.
 
         They still tell their place in their beacons.
         """
@@ -387,7 +387,7 @@ class FlightControl:
         )
 
     def _revoked_places(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
-        """Who is not listened to any more, where it was: it may still hover there."""
+        """Robots that are not listened to any more, where they were: they may still hover there."""
         for neighbour in heard:
             self._last_places[neighbour.robot_id] = neighbour, now_s - neighbour.age_s
         silent = self.revoked.intersection(self._last_places) - {n.robot_id for n in heard}
@@ -405,7 +405,7 @@ class FlightControl:
         silence: SilenceLimits,
         now_s: float,
     ) -> tuple[Neighbour, ...]:
-        """Who flew when it last told its place, and tells none now: it may come down there.
+        """Robots that last told their place in flight, and tell none now: they may come down there.
 
         Who is not listened to any more is none of these: its last word may have been a lie.
         """

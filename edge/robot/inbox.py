@@ -1,4 +1,4 @@
-"""What came by radio, kept for the loops: the ground's state and orders, and others' beacons.
+"""Messages that came by radio, kept for the loops: the ground's state, orders, others' beacons.
 
 The link's threads only put bytes in; whoever takes something out decodes it.
 """
@@ -177,7 +177,7 @@ class Inbox:
         return ground is not None and 0 < sequence - ground.sequence <= _MOST_SEQUENCES_AHEAD
 
     def safety_form(self, now_s: float) -> SafetyAction:
-        """What a ground asks whose states are not understood: hold, land, or none. Control thread.
+        """Request of a ground whose states are not understood: hold, land, or none. Control thread.
 
         The last state that was understood stays, and its age grows.
         """

@@ -162,7 +162,7 @@ class RobotNode:
 
     @property
     def subscriptions(self) -> Mapping[Topic, ReceiveCallback]:
-        """What it hears: topic -> callback with the key and the data, from any thread."""
+        """Subscriptions: topic -> callback with the key and the data, from any thread."""
         return self._guard.subscriptions(
             {
                 MESSAGE: self._receive_message,
@@ -173,7 +173,7 @@ class RobotNode:
         )
 
     def attach(self, link: Link) -> None:
-        """What it says goes there from now on."""
+        """Set the link to publish on from now on."""
         self._link = self._guard.over(link)
 
     def _receive_state(self, _: str, data: bytes, speaker: Speaker) -> None:
@@ -289,7 +289,7 @@ class RobotNode:
         self._publish(MESSAGE, data)
 
     def try_sensor(self) -> str:
-        """What is wrong with a reading at its own height above where it lands; "" if nothing is.
+        """Describe the fault of a reading at its own height where it lands; "" if there is none.
 
         For a robot that is only checked: its loops do not run.
         """
@@ -495,11 +495,11 @@ class RobotNode:
 
     @property
     def failed_checks(self) -> tuple[FailedCheck, ...] | None:
-        """What keeps it on the ground; None while the checks are still running."""
+        """Failed checks; None while the checks are still running."""
         return self._control.failed_checks(self._ports.clock.monotonic_s())
 
     def leave(self, on_stop: Action) -> Action | None:
-        """What is to be asked of a vehicle that it flew, when its program ends; None if nothing.
+        """Request to a vehicle that it flew, when its program ends; None if there is none.
 
         Once its control step is called no more.
         """
@@ -510,7 +510,7 @@ class RobotNode:
             self._link.publish(topic, data)
 
     def _message_counts(self) -> dict[str, int]:
-        """What became of all that came, from the policy's messages out to the radio's."""
+        """Counts of all that came, from the policy's messages out to the radio's."""
         not_admitted = 0 if self._link is None else self._link.refused()
         besides = {"not_admitted": not_admitted, "not_understood": self._inbox.not_understood_count}
         counts = self._pac.mailbox.counts() | self._guard.refused()
@@ -528,7 +528,7 @@ class RobotNode:
 
 
 def _news(status: RobotStatus) -> tuple[object, ...]:
-    """What the ground is to hear of at once if it changes; of texts only what they are about."""
+    """Values whose change the ground is to hear of at once; of texts only what they are about."""
     return (
         status.state, status.reason.code, status.ready, status.orders, status.obeyed_sequence,
         status.operator, status.trial, status.world_id, status.origin, status.fence, status.armed,

@@ -67,7 +67,7 @@ class PacParameters(Bounded):
 
 
 def message_bytes(policy: Policy, payload: PayloadType) -> tuple[int, int]:
-    """What a robot's message takes, beacon and envelope included, if its numbers do not compress.
+    """Size of a robot's message, beacon and envelope included, if its numbers do not compress.
 
     Without its map, and with one that does not compress either: most maps do.
     """
@@ -91,7 +91,7 @@ class _Timed:
 
 
 class _Told(NamedTuple):
-    """What the neighbours may know, and of which mission."""
+    """Map for the neighbours, and its mission."""
 
     trial: int
     shared: SharedMap | None
@@ -99,7 +99,7 @@ class _Told(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolicyTick:
-    """What `Pac.infer` did.
+    """Record of one `Pac.infer`.
 
     From `features` and the `payloads` of `senders`, for a node of `degree` neighbours, came
     `velocity` (2,), in model units, and `message`, the bytes for the neighbours.
@@ -235,7 +235,7 @@ class Pac:
         return perceived
 
     def explored(self) -> Bools:
-        """What it has seen, as `mission.explored_to_bytes` takes it; valid until it goes on."""
+        """Explored map, as `mission.explored_to_bytes` takes it; valid until the robot goes on."""
         return self._memory.explored
 
     def infer(self, now_s: float, *, on_ground: bool = False) -> PolicyTick | None:
@@ -303,7 +303,7 @@ class Pac:
 
     @property
     def problem(self) -> str:
-        """What is wrong with what the sensor, or the policy, gave last; "" if nothing is."""
+        """Describe the fault of the sensor's, or the policy's, last result; "" if there is none."""
         # They are set in the threads of perception and of the policy.
         of_sensor, of_policy = self._sensor_problem, self._observe_problem or self._step_problem
         if of_sensor:
@@ -311,7 +311,7 @@ class Pac:
         return f"policy: {of_policy}" if of_policy else ""
 
     def try_sensor(self, position_m: Position) -> str:
-        """What is wrong with a reading from there, mission frame; "" if nothing is.
+        """Describe the fault of a reading from there, mission frame; "" if there is none.
 
         For a robot that is only checked: nothing may perceive meanwhile.
         """
@@ -338,7 +338,7 @@ class Pac:
         return odometry if all(map(math.isfinite, numbers)) else None
 
     def _look(self, own: F64, height_m: float) -> tuple[F32, Bools | None] | None:
-        """What the sensor shows, and where it saw, if that is not everywhere; None without that."""
+        """The sensor's view, and where it saw, if that is not everywhere; None without that."""
         shown: tuple[F32, Bools | None] | None
         try:
             sensor = self.sensor
@@ -365,7 +365,7 @@ class Pac:
         return None if problem else (view, seen)
 
     def _observe(self, observation: Observation) -> Perceived | None:
-        """What the policy makes of it, if that can be used."""
+        """The policy's result from an observation, if that can be used."""
         try:
             perceived = self._agent.observe(observation)
         except Exception as error:
@@ -375,7 +375,7 @@ class Pac:
         return None if self._observe_problem else perceived
 
     def _step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep | None:
-        """What the policy decides, if that can be used."""
+        """The policy's decision, if that can be used."""
         try:
             if self._reset_agent:
                 self._reset_agent = False

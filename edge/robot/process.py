@@ -169,7 +169,7 @@ def _open_vehicle(config: RobotConfig) -> AbstractContextManager[OpenVehicle]:
 
 
 def _identity(config: RobotConfig, load: Callable[[Path], Identity]) -> Identity | None:
-    """Who this robot is in its fleet; None if nobody says so. Raises ConfigError or OSError."""
+    """This robot's identity in its fleet; None if there is none. Raises ConfigError or OSError."""
     if not config.identity.folder:
         return None
     identity = load(Path(config.identity.folder))
@@ -259,7 +259,7 @@ class _Program:
                 Path(f"/proc/self/task/{thread}/comm").write_text(loop.name)
 
     def news(self) -> list[str]:
-        """What systemd is to know now. Waits for nothing."""
+        """Messages to systemd of the present state. Waits for nothing."""
         news = [] if self._status_text is None else [self._status_text]
         ages_s = [loop.age_s() for loop in self._loops]
         if None not in ages_s:
@@ -346,7 +346,7 @@ def _robot_lock(config: RobotConfig) -> ProcessLock:
 
 
 class CheckReport(NamedTuple):
-    """What `check` found: what PX4 would do, what was set, and what keeps the robot from flying.
+    """Findings of `check`: PX4's reactions, what was set, and what keeps the robot from flying.
 
     `version` is PX4's, and how far it was tried.
     """

@@ -1,4 +1,4 @@
-"""What keeps the robot from flying: gathers what preflight's checks ask for.
+"""Readiness to fly: gathers the inputs of preflight's checks.
 
 One thread only, and not the control loop's: a vehicle that falls silent while it is asked something
 holds up the caller for many seconds.
@@ -34,7 +34,7 @@ _MAX_ANSWER_AGE_S = 2.0
 
 
 class Assignment(NamedTuple):
-    """What a robot flies by, as the ground sets it: where, its fence and place, and its world."""
+    """A robot's assignment, as the ground sets it: where, its fence and place, and its world."""
 
     origin: Origin | None
     robot: Robot
@@ -42,7 +42,7 @@ class Assignment(NamedTuple):
 
 
 class Checks(NamedTuple):
-    """What preflight found at one time, for one assignment: one line for each failed check."""
+    """Findings of preflight at one time, for one assignment: one line for each failed check."""
 
     failed: tuple[FailedCheck, ...]
     at_s: float

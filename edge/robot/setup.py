@@ -22,7 +22,7 @@ class SetupError(OSError):
 
 
 class SetupReport(NamedTuple):
-    """What was done with the vehicle that answers as `system_id`.
+    """Outcome of setting up the vehicle that answers as `system_id`.
 
     `changes` are the parameters that were set, `problems` what is wrong all the same. With
     `needs_reboot`, some of it counts only after the autopilot was restarted.

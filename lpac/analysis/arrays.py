@@ -45,7 +45,7 @@ class Columns:
 
 
 def log_arrays(path: Path | str, *topics: str) -> dict[str, dict[str, Columns]]:
-    """What a log holds, or all logs below a folder: log's name -> topic -> its columns.
+    """Read a log, or all logs below a folder: log's name -> topic -> its columns.
 
     A log's name is its files' without their number, such as "robot-3": these are read one after
     another. With `topics` only these are read, which is faster, and each log has all of them.

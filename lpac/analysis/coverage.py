@@ -1,4 +1,4 @@
-"""What a fleet's positions are worth: the paper's coverage cost, Lloyd's, and Voronoi cells."""
+"""Value of a fleet's positions: the paper's coverage cost, Lloyd's, and Voronoi cells."""
 
 import math
 from typing import Protocol
@@ -27,7 +27,7 @@ _FURTHEST_M = 1e6
 
 
 class World(Protocol):
-    """What `Coverage` is made of; `lpac.analysis.snapshot.FleetSetup` says what each is."""
+    """Description of a world; `lpac.analysis.snapshot.FleetSetup` says what each value is."""
 
     @property
     def world(self) -> str: ...

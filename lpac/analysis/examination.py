@@ -1,4 +1,4 @@
-"""What is in flight logs: a record of each mission, and what a reader should know of these."""
+"""Examination of flight logs: a record of each mission, and notes for the reader."""
 
 import contextlib
 import math
@@ -36,7 +36,7 @@ class _World:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """What the report is to be of: only the missions called `missions` (none: all), snapshots at
+    """Scope of the report: only the missions called `missions` (none: all), snapshots at
     `times_s` (none: at the begin, a quarter, half and all of each), over the world in `world`, for
     the policy in `bundle`. `world_option` is what its reader gives the world by.
     """
@@ -60,7 +60,7 @@ class Examined(NamedTuple):
     notes: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
-        """What is to be said of them, as JSON values."""
+        """Summary as JSON values."""
         return {"trials": [_values(record) for record in self.records], "notes": list(self.notes)}
 
 
@@ -72,7 +72,7 @@ def examine(
     wanted: Wanted = _EVERYTHING,
     progress: Progress = lambda *_: None,
 ) -> Examined:
-    """What is in the logs below `folders`.
+    """Examine the logs below `folders`.
 
     `progress` gets what is being done, and the share of it. Raises ValueError if there are no logs,
     or no mission in them; OSError if something cannot be read.
@@ -253,7 +253,7 @@ def _notes(logs: Logs, record: FlightRecord, wanted: Wanted) -> Iterable[str]:
 
 
 def _values(record: FlightRecord) -> dict[str, Any]:
-    """What is to be said of a mission, as JSON values."""
+    """Values of a mission, as JSON."""
     told = record.messages
     return {
         "trial": record.name,

@@ -34,7 +34,7 @@ _GAP_S = 0.5
 
 
 class Measured(NamedTuple):
-    """What one file tells: Unix time (T,), ascending, and places (T, 3).
+    """Measurements in one file: Unix time (T,), ascending, and places (T, 3).
 
     x, y, m, of the mission frame, or latitude and longitude, deg, if `is_global`; and the height
     above the ground, m.
@@ -64,7 +64,7 @@ def read_places(path: Path) -> Measured:
 
 
 def track_of(files: Iterable[Measured], to_mission: ToMission) -> TrueTrack:
-    """What all files of one robot tell; where they tell nothing for a while, nothing is known."""
+    """Join all files of one robot; where they tell nothing for a while, nothing is known."""
     parts = [(file.unix_s, _in_mission(file, to_mission)) for file in files]
     time_s = np.concatenate([np.zeros(0), *(part[0] for part in parts)])
     position_m = np.concatenate([np.zeros((0, 3)), *(part[1] for part in parts)])

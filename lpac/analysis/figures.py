@@ -558,7 +558,7 @@ def _robot_handle(colour: str, label: str) -> Line2D:
 
 
 def _frame(panels: Any, flight: FlightRecord, *, margin: bool) -> None:
-    """What maps have in common: the world's limits, or with a margin all that was flown in."""
+    """Set the limits of maps: the world's, or with a margin all that was flown in."""
     for axes in panels.ravel():
         axes.set_aspect("equal")
         for axis in (axes.xaxis, axes.yaxis):

@@ -1,4 +1,4 @@
-"""What robots and ground recorded, brought together on one clock.
+"""Logs of robots and ground, brought together on one clock.
 
 A robot says each status once; its own log has it, and the ground's too if it was heard. Times are
 made from the robot's uptime, which does not jump, and from when the ground heard it: so robots
@@ -48,7 +48,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class LoggedStatus:
-    """What the report needs of a status; `time_s` is Unix time of the common clock.
+    """The part of a status that reports need; `time_s` is Unix time of the common clock.
 
     Loops whose lateness it did not know are left out; the landing point is NaN if it was.
     """
@@ -126,7 +126,7 @@ class Logs:
     notes: list[str] = field(default_factory=list)
 
     def name(self, robot_id: int) -> str:
-        """What people call the robot."""
+        """The robot's name, for people."""
         return self.names.get(robot_id, str(robot_id))
 
 

@@ -8,7 +8,7 @@ _SILENT_S = 10.0
 
 
 class MissionStatus(Protocol):
-    """What is to be known of a robot: a `RobotStatus`, or a part of it."""
+    """State of a robot that tracking needs: a `RobotStatus`, or a part of it."""
 
     @property
     def boot_nonce(self) -> int: ...

@@ -75,7 +75,7 @@ def find_missions(logs: Logs) -> list[Mission]:
 
 
 def _in_order(logs: Logs) -> Iterator[tuple[int, LoggedStatus]]:
-    """What all robots said, by robot id."""
+    """All robots' statuses in order of time, with the robot's id."""
     said = [zip(itertools.repeat(robot), statuses) for robot, statuses in logs.statuses.items()]
     return heapq.merge(*said, key=lambda one: one[1].time_s)
 

@@ -1,4 +1,4 @@
-"""What a ground station knows of its fleet, as its log holds it and its clients are told."""
+"""A ground station's knowledge of its fleet, as its log holds it and its clients are told."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -22,7 +22,7 @@ class FleetSlot:
 
 @dataclass(frozen=True, slots=True)
 class FleetSetup:
-    """What does not change, or seldom.
+    """The part that does not change, or seldom.
 
     `operator` is this station's. `robots` are the robots' ids by name, in the fleet's order. The
     policy's world is `world_size` cells wide, `env_scale` of them per m, from the mission origin
@@ -123,7 +123,7 @@ class GroundEvent:
 
 @dataclass(frozen=True, slots=True)
 class Explored:
-    """What a robot has explored: `explored_to_bytes` in base64."""
+    """A robot's explored map: `explored_to_bytes` in base64."""
 
     robot: str
     cells: str

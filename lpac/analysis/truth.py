@@ -45,7 +45,7 @@ class TrueTrack:
         return np.where(self.airborne[after, None], self.positions_at(times_s), np.nan)
 
     def between(self, from_s: float, to_s: float, zero_s: float) -> "TrueTrack":
-        """What lies between two times; its times then count from `zero_s`."""
+        """Cut out the part between two times; its times then count from `zero_s`."""
         inside = (self.time_s >= from_s) & (self.time_s <= to_s)
         return TrueTrack(
             self.time_s[inside] - zero_s, self.position_m[inside], self.airborne[inside]
@@ -67,7 +67,7 @@ def write_truth(tracks: Mapping[int, TrueTrack], path: Path) -> None:
 
 
 def load_truth(path: Path) -> dict[int, TrueTrack]:
-    """What `write_truth` wrote. Raises ValueError that says what is wrong, OSError."""
+    """Read a file of `write_truth`. Raises ValueError that says what is wrong, OSError."""
     try:
         with ZipFile(path) as file:
             # As it is written: nothing unpacks to more.

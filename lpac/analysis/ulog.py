@@ -1,4 +1,4 @@
-"""What PX4's own log holds (ULog), topic by topic."""
+"""PX4's own log (ULog), topic by topic."""
 
 import struct
 from collections.abc import Sequence

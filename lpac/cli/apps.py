@@ -14,7 +14,7 @@ class CommandList(TyperGroup):
     """A group of commands whose help lists each with the whole first sentence of its own."""
 
     def first_sentence(self, ctx: Any, name: str) -> str:
-        """What that command does."""
+        """First sentence of that command's help."""
         command = self.get_command(ctx, name)
         assert command is not None
         return command.get_short_help_str(_WHOLE_LINE)

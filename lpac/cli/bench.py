@@ -39,7 +39,7 @@ def bench() -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkOptions:
-    """What is measured, how often, and where."""
+    """Options: experiments, repetitions, and places."""
 
     experiments: Annotated[
         list[str] | None,

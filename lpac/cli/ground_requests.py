@@ -36,7 +36,7 @@ class Addressed(NamedTuple):
 
 
 def address(path: Path, robots: str | None) -> Addressed:
-    """Whom a command addresses. Raises ConfigError for an unknown robot, or without fleet.toml."""
+    """Resolve a command's robots. Raises ConfigError for an unknown one, or without fleet.toml."""
     from lpac.fleet.settings import load_fleet, select
 
     config = load_fleet(path)
@@ -105,7 +105,7 @@ def show(
 
 @contextmanager
 def looking(to: Addressed) -> Iterator["GroundSubscriber"]:
-    """What the ground tells, as long as this context lasts. Raises GroundError."""
+    """Subscribe to the ground, as long as this context lasts. Raises GroundError."""
     from lpac.ground.station.subscriber import GroundSubscriber
 
     with GroundSubscriber(to.fleet) as subscriber:

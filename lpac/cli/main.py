@@ -154,7 +154,7 @@ def main() -> None:
 
 
 def _in_words(error: OSError) -> str:
-    """What is wrong with which file; as it is, if it is no file's, or a person wrote it."""
+    """The file and its fault; the error as it is, if it is no file's, or a person wrote it."""
     from edge.core.file_errors import in_words, is_known
 
     if error.filename is None or not is_known(error):

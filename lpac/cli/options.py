@@ -53,7 +53,7 @@ class OfFleet:
 
 
 class VehicleKind(StrEnum):
-    """What the robots fly."""
+    """Kinds of vehicles."""
 
     POINT = "point"
     SIMULATED = "simulated"
@@ -117,7 +117,7 @@ def found(path: Path | None) -> Path | None:
 
 
 def user_at_host() -> str:
-    """What this operator is called if nothing says otherwise. Raises ValueError."""
+    """Default name of this operator. Raises ValueError."""
     try:
         return f"{getpass.getuser()}@{socket.gethostname()}"
     except (KeyError, OSError):

@@ -166,7 +166,7 @@ def _shown(progress: "Progress", how_far: Callable[[], str]) -> AbstractContextM
 
 
 def time_left(left_s: float | None) -> list[str]:
-    """What is said of it: nothing if nobody knows."""
+    """Words for the time that is left: none if it is not known."""
     if left_s is None:
         return []
     minutes = round(left_s / 60.0)

@@ -26,7 +26,7 @@ _ROUNDS = "another kind of processor rounds otherwise in the last digits, the sa
 
 
 class _RunAgain(NamedTuple):
-    """What came of it: of the policy, if it ran, and of the flight by segment of the logs."""
+    """Result of the run: of the policy, if it ran, and of the flight by segment of the logs."""
 
     metadata: "Mapping[Path, FlightMetadata]"
     bundle: "Bundle | None"
@@ -178,7 +178,7 @@ def _told_already(_: "Missing") -> None:
 def _flights(
     metadata: "Mapping[Path, FlightMetadata]", missing: "list[Missing]"
 ) -> "dict[Path, FlightReplay]":
-    """What the programs decide now, by their logs. A program's segments are in order."""
+    """Decide the programs' flights again, by their logs. A program's segments are in order."""
     from edge.drivers.flight_log import read
     from edge.flight.record import TickError, TickReader
     from edge.flight.replay import FlightReplay

@@ -21,7 +21,7 @@ app = new_app()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportOptions:
-    """What it is about, and where it goes."""
+    """Options: logs, missions, and the report's folder."""
 
     folders: Annotated[
         list[Path],

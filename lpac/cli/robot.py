@@ -22,7 +22,7 @@ _END_WITHIN_S = 2.9
 
 
 class Rc(StrEnum):
-    """Who may take the vehicle by remote control."""
+    """Remote control that can take the vehicle."""
 
     PILOT = "pilot"
     NONE = "none"

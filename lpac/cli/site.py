@@ -33,7 +33,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="The site's name.")]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SiteOptions:
-    """What is saved."""
+    """Options of a site that is saved."""
 
     name: Name
     from_robot: Annotated[

@@ -60,7 +60,7 @@ def _progress() -> "Iterator[Callable[[RunProgress], None]]":
 
 
 def numbers_of_training(now: "RunProgress") -> list[str]:
-    """What is known of them."""
+    """Words for the numbers that are known."""
     loss = [] if now.loss is None else [f"loss {now.loss:.3f}"]
     return loss if now.cost is None else [*loss, f"closed-loop cost {now.cost:.3f}"]
 

@@ -32,7 +32,7 @@ def transport_named(text: str) -> "Transport":
 
 
 def calibration(wifi: Path | None, *, transport: bool) -> "Calibration":
-    """What the file says, if any. Raises ConfigError, OSError, ValueError."""
+    """Read the file, if any. Raises ConfigError, OSError, ValueError."""
     from lpac.radio.calibration import read_wifi
 
     if wifi is not None and not transport:
@@ -41,7 +41,7 @@ def calibration(wifi: Path | None, *, transport: bool) -> "Calibration":
 
 
 def link_line(loss: float, delay_s: float) -> str:
-    """What messages suffer."""
+    """Describe loss and delay of messages."""
     return (
         f"by the model {100.0 * loss:.3g} % of messages are lost, and the others travel for "
         f"{1e3 * delay_s:.3g} ms on average"

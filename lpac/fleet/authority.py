@@ -86,7 +86,7 @@ class _Ledger(msgspec.Struct):
 
 
 class Issued(NamedTuple):
-    """What a member is handed; the files of its folder by name.
+    """A new member, and the files of its folder by name.
 
     A robot's keys of the group are secret: the way there must be.
     """
@@ -150,7 +150,7 @@ class Authority:
         return Issued(member, self.files(member))
 
     def files(self, member: Member) -> dict[str, bytes]:
-        """What the member has of the authority: the files of its folder by name."""
+        """Files of the member's folder that are the authority's, by name."""
         common_name = member.role.value
         if member.robot_id is not None:
             common_name = f"robot-{member.robot_id}"
@@ -166,7 +166,7 @@ class Authority:
         }
 
     def group_keys(self) -> bytes:
-        """What robots have of the multicast group's keys: the file of that name."""
+        """Keys of the multicast group for robots: the file of that name."""
         return group_keys_text(list(map(bytes.fromhex, self._read().group_keys)))
 
     def renew_group_key(self) -> bool:
@@ -261,7 +261,7 @@ class Authority:
 
     @contextmanager
     def _changed(self) -> Iterator[_Ledger]:
-        """What is said of members meanwhile is written, unless something is raised."""
+        """Write the changes to members that are made meanwhile, unless something is raised."""
         with (self.folder / _SECRET).open("rb") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             ledger = self._read()

@@ -1,4 +1,4 @@
-"""Who belongs to the fleet: cards for robots, whose keys stay on them, and for ground stations."""
+"""Membership: cards for robots, whose keys stay on them, and for ground stations."""
 
 import base64
 import hashlib
@@ -14,7 +14,7 @@ from lpac.fleet.settings import FleetConfig, RobotHost
 
 
 class CardGiven(NamedTuple):
-    """What became of a robot's card; None: the fleet has no keys."""
+    """Outcome for a robot's card; None: the fleet has no keys."""
 
     outcome: Literal["done", "was so already"] | None
     new_authority: Path | None

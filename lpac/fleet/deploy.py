@@ -14,7 +14,7 @@ _MODES = "--chmod=Du=rwx,Dgo=rx"
 
 
 class Deployed(NamedTuple):
-    """What a robot has now, and what it took: bytes of content, and its policy's ticks, ms."""
+    """A robot's new release, and its cost: bytes of content, and its policy's ticks, ms."""
 
     release: str
     summary: str

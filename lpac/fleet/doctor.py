@@ -1,4 +1,4 @@
-"""What a robot needs before a flight: looked at over SSH, judged here, each fault with its fix."""
+"""Checks of a robot before a flight: looked at over SSH, judged here, each fault with its fix."""
 
 import hashlib
 import re
@@ -83,7 +83,7 @@ class ClockOffset(NamedTuple):
 
 
 class Examination(NamedTuple):
-    """What was found on one robot that answered.
+    """Findings on one robot that answered.
 
     `vehicle` is what `lpac robot check` says, or why it was not asked; `pings` are by the other
     robots' names, or why there are none.
@@ -311,7 +311,7 @@ def _group(robot: RobotHost, fleet: Mapping[str, Facts]) -> DoctorCheck:
 
 
 def _others_than_most(has: Mapping[str, Any], robot: str) -> list[str]:
-    """Who has something else than a robot; nobody if it has what most have.
+    """Robots that have something else than this one; none if it has what most have.
 
     Where no half of the fleet agrees, nobody is right.
     """

@@ -234,7 +234,7 @@ def _login_problem(config: FleetConfig, robot: RobotHost) -> str | None:
 
 
 def _public_keys(config: FleetConfig, robot: RobotHost) -> str:
-    """What authorized_keys is to hold: the agent's keys, and those that ssh would use here."""
+    """Content of authorized_keys: the agent's keys, and those that ssh would use here."""
     lines = []
     options = _ssh_options(config, robot)
     if options.get("identitiesonly") != ["yes"]:
@@ -249,7 +249,7 @@ def _public_keys(config: FleetConfig, robot: RobotHost) -> str:
 
 
 def _ssh_options(config: FleetConfig, robot: RobotHost) -> dict[str, list[str]]:
-    """What OpenSSH's configuration says of this host."""
+    """Read OpenSSH's configuration of this host."""
     *command, host = ssh_command(config, robot)
     done = subprocess.run([*command, "-G", host], capture_output=True, text=True, check=False)
     if done.returncode != 0:
@@ -340,7 +340,7 @@ def _done(
 def _value(
     config: FleetConfig, robot: RobotHost, table: str, key: str, default: object = None
 ) -> object:
-    """What robot.toml would have there."""
+    """Value that robot.toml would have there."""
     value = config.values_of(robot).get(table, {}).get(key, default)
     if value is None:
         raise ConfigError(f"{config.path}: robot.{table}.{key} is missing")

@@ -89,7 +89,7 @@ def check_identity(
 def wrong_identity(
     identity: dict[str, object] | None, config: FleetConfig, robot: RobotHost
 ) -> tuple[str, str] | None:
-    """Who answers at the robot's address instead of it, and what to do; None if it does."""
+    """Describe who answers instead of the robot, and what to do; None if the robot does."""
     if identity is None:
         return "it is not enrolled", f"run `lpac fleet enroll {robot.name} {robot.host}` once"
     wanted = {"fleet": config.fleet, "robot": robot.name, "robot_id": robot.robot_id}

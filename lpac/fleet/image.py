@@ -37,7 +37,7 @@ def measure(folder: Path) -> ImageSize:
 
 
 def package_of(path: PurePosixPath) -> str:
-    """Whose a file is, from its path in the tree."""
+    """Package that a file belongs to, from its path in the tree."""
     if path.is_relative_to(_SITE):
         name = path.relative_to(_SITE).parts[0]
         return name.split("-")[0].removesuffix(".libs")

@@ -279,7 +279,7 @@ def _nft_matches(match: dict[str, Any], port: int) -> bool:
 
 
 def _output(*command: str) -> str:
-    """What a program prints; nothing if it is not here."""
+    """Output of a program; empty if it is not here."""
     return _run(*command)[1]
 
 

@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class Outcome(NamedTuple, Generic[T]):
-    """What came of it for one robot: a value, or why there is none.
+    """Outcome for one robot: a value, or why there is none.
 
     `interrupted`: Ctrl-C came before it was done.
     """

@@ -15,7 +15,7 @@ SUMS = "SHA256SUMS"
 
 
 class Pulled(NamedTuple):
-    """What was fetched to `folder`, how much of it travelled, and a word about it."""
+    """Files that were fetched to `folder`, how much of them travelled, and a word about it."""
 
     folder: str
     files: int

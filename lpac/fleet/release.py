@@ -1,4 +1,4 @@
-"""What goes to a robot as one: image, policy, world, configuration, unit, lock of versions.
+"""Release: image, policy, world, configuration, unit and lock of versions, sent as one.
 
 A release is named by its content: the first 16 hexadecimal digits of its manifest's sha256.
 """
@@ -61,7 +61,7 @@ class Release(NamedTuple):
 
 
 class Common(NamedTuple):
-    """What the releases of a fleet share, checked."""
+    """Parts that the releases of a fleet share, checked."""
 
     image: Image
     bundle: Bundle
@@ -138,7 +138,7 @@ def make_release(config: FleetConfig, robot: RobotHost, common: Common, folder: 
 
 
 def drop_ins(config: FleetConfig, robot: RobotHost) -> dict[str, str]:
-    """What differs from the units: the texts of lpac-robot.conf and lpac-land.conf, if any."""
+    """Overrides of the units: the texts of lpac-robot.conf and lpac-land.conf, if any."""
     unit, place = [], []
     if config.directory != DEFAULT_DIRECTORY:
         current = f"{config.directory}/current"

@@ -95,13 +95,13 @@ def ssh_command(config: FleetConfig, robot: RobotHost) -> list[str]:
 
 
 def as_root(command: str) -> str:
-    """What the login shell is to run `command` as root: releases, units, journals are root's."""
+    """Command line for the login shell that runs `command` as root, who owns releases and units."""
     text = f'if [ "$(id -u)" = 0 ]; then exec {command}; else exec sudo -n {command}; fi'
     return f"exec sh -c {shlex.quote(text)}"
 
 
 def explain(text: str, host: str) -> str:
-    """What ssh's or rsync's last words mean, in one line."""
+    """Explain ssh's or rsync's last words in one line."""
     for pattern, advice in _ADVICE:
         if re.search(pattern, text):
             return advice.replace("HOST", host)

@@ -238,7 +238,7 @@ class FleetConfig:
 
     @property
     def mode(self) -> Literal["peer", "client"]:
-        """What zenoh's sessions are: clients of a router, or peers."""
+        """Mode of zenoh's sessions: clients of a router, or peers."""
         return "client" if self.router else "peer"
 
     @property
@@ -260,7 +260,7 @@ class FleetConfig:
         return max(margins, default=None)
 
     def values_of(self, robot: RobotHost) -> dict[str, Any]:
-        """What the file says of the robot's robot.toml: [robot], and its own values over them."""
+        """Settings of the robot's robot.toml: [robot], and its own values over them."""
         return _merged(self.shared, robot.overrides)
 
     def robot_mapping(self, name: str, places: Places) -> dict[str, Any]:
@@ -272,7 +272,7 @@ class FleetConfig:
         return _robot_mapping(self, robot, slot, places)
 
     def robot_config(self, name: str) -> RobotConfig:
-        """What the robot flies by. Raises ConfigError for an unknown robot or a spare."""
+        """Configuration that the robot flies by. Raises ConfigError for a stranger or a spare."""
         return from_mapping(RobotConfig, self.robot_mapping(name, IN_RELEASE), str(self.path))
 
 

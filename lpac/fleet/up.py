@@ -32,7 +32,7 @@ _LOST = 0.05
 
 
 class Arrival(NamedTuple):
-    """What was done on a robot to bring it up, and what could not be, in words."""
+    """Steps done on a robot to bring it up, and problems, in words."""
 
     done: tuple[str, ...]
     problems: tuple[str, ...]
@@ -59,7 +59,7 @@ class Pack(NamedTuple):
 
 
 class GroupCost(NamedTuple):
-    """What a robot's message takes in a multicast group: datagrams, all of which must come.
+    """Cost of a robot's message in a multicast group: datagrams, all of which must come.
 
     `datagrams` are from so many, with a map that is almost nothing, to so many, with one that does
     not compress; `lost` is the share of messages, each of it, that are lost if one datagram of
@@ -188,7 +188,7 @@ def board(
 def packs(
     config: FleetConfig, examinations: Sequence[Outcome[Examination]], trial_s: float
 ) -> list[Pack]:
-    """What the robots' batteries are good for, as their programs know them: the slots' robots."""
+    """Endurance of the batteries in the slots' robots, as their programs know them."""
     found = []
     for outcome in examinations:
         robot, examination = outcome.robot, outcome.value

@@ -1,4 +1,4 @@
-"""What the robots' radios tell of themselves over SSH, and a stream of bytes to disturb them."""
+"""State of the robots' radios over SSH, and a stream of bytes to disturb them."""
 
 import contextlib
 import ipaddress
@@ -53,7 +53,7 @@ def in_the_wifi(address: str, root: Path = Path("/")) -> bool:
 
 
 def reading(before: Sequence[Interface], after: Sequence[Interface]) -> WifiReading:
-    """What a robot's Wi-Fi told between two looks: of the interface that has a network."""
+    """Reading of a robot's Wi-Fi between two looks: of the interface that has a network."""
     now = next((one for one in after if one["connected"]), None)
     if now is None:
         return WifiReading()
@@ -73,7 +73,7 @@ def _busy_share(before: Interface, after: Interface) -> float | None:
 
 
 class BulkStream:
-    """What came of it so far."""
+    """Bulk stream from a robot, as far as it came."""
 
     def __init__(self, robot: str) -> None:
         self.robot = robot

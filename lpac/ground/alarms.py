@@ -1,4 +1,4 @@
-"""What an operator must see now, of all that the ground knows; nothing here has a clock."""
+"""Alarms for the operator, of all that the ground knows; nothing here has a clock."""
 
 import math
 from collections import Counter, deque
@@ -53,7 +53,7 @@ T = TypeVar("T", bound=Hashable)
 
 
 class AlarmCode(StrEnum):
-    """What an alarm is about."""
+    """Subject of an alarm."""
 
     # The fleet.
     NOBODY_COMMANDS = "nobody_commands"
@@ -276,7 +276,7 @@ def _own(fleet: _Fleet, seen: _Seen) -> _Found:
 
 
 def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
-    """What the ground said in the picture before already, and the robot has had time to obey."""
+    """Alarm if the robot has had time to obey the ground's state before, and has not."""
     said, status = fleet.ground_before, seen.status
     if said is None or fleet.ground is None:
         return None
@@ -365,7 +365,7 @@ def _features(fleet: _Fleet, seen: _Seen) -> _Found:
 
 
 def _neighbours(fleet: _Fleet, seen: _Seen) -> _Found:
-    """Whom it does not hear well of those in range; what one robot is to blame for, it alone."""
+    """Alarm of senders in range that it does not hear well; of one robot's fault, it alone."""
     found: Blame = fleet.blame
     deaf, mute = seen.name in found.receivers, seen.name in found.senders
     badly = [sender for sender, receiver in found.links if receiver == seen.name]

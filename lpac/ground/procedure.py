@@ -1,4 +1,4 @@
-"""What takes several commands, and waits in between, as steps that somebody else times.
+"""Procedures of several commands, with waits in between, as steps that somebody else times.
 
 A procedure is a generator. It yields what it wants: a `Request` for the ground, answered by its
 `CommandReport`, or `Until`, answered by whether that came true in time. Whoever has the ground
@@ -30,11 +30,11 @@ Procedure = Generator[Request | Until, Any, T]
 
 
 class Ground(Protocol):
-    """What a procedure knows of the ground, as it was told last."""
+    """A procedure's view of the ground, as it was told last."""
 
     @property
     def setup(self) -> FleetSetup:
-        """What seldom changes."""
+        """The fleet's setup, which seldom changes."""
         ...
 
     @property
@@ -68,7 +68,7 @@ def fresh_snapshot(ground: Ground) -> Procedure[FleetSnapshot]:
 def gather(
     ground: Ground, robots: Collection[str], duration_s: float
 ) -> Procedure[dict[str, list[RobotStatus]]]:
-    """What these robots say from now on, each status once.
+    """Collect the statuses of these robots from now on, each once.
 
     For `duration_s`, and `FRESH_S` more for one of which nothing came; [] if that is silent.
     """

@@ -48,7 +48,7 @@ _MAX_TOTAL_BYTES = 2**34
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What the robots' positions are worth now: the paper's J, model units.
+    """Cost of the robots' positions now: the paper's J, model units.
 
     `robots` are those that count, by name (see `lpac.analysis.coverage.Whereabouts`);
     `flying_mission` whether one of them flies its mission, which begins anew as
@@ -80,7 +80,7 @@ TOPICS = {
 
 @dataclass(frozen=True, slots=True)
 class GroundMetadata:
-    """Whose ground wrote the log."""
+    """Metadata of the ground that wrote the log."""
 
     fleet: str
     version: str

@@ -1,4 +1,4 @@
-"""What somebody needs to see who carries a robot over the field before it flies there."""
+"""Rehearsal: guidance for a person who carries a robot over the field before it flies there."""
 
 import math
 from typing import NamedTuple
@@ -16,7 +16,7 @@ _STILL_M_S = 0.05
 
 
 class Commanded(NamedTuple):
-    """What the policy asks for: `arrow` in the mission frame, y up; `words` from the nose."""
+    """Command of the policy: `arrow` in the mission frame, y up; `words` from the nose."""
 
     speed_m_s: float
     arrow: str
@@ -56,7 +56,7 @@ class Carried(NamedTuple):
 
 
 def carried(status: RobotStatus, configured: Fence) -> Carried:
-    """What a robot's status tells to somebody who carries it."""
+    """Read a robot's status for the person who carries it."""
     position_m = None if status.position_m is None else status.position_m[:2]
     nose_deg = None
     if status.heading_rad is not None and status.origin is not None:

@@ -152,7 +152,7 @@ class MissionStep(Bounded):
             given ^= {perturbation.robot}
 
     def in_time(self) -> list[Perturbation]:
-        """What is to be done, by its time."""
+        """Perturbations in order of time."""
         return sorted(self.perturb, key=lambda perturbation: perturbation.at_s)
 
 
@@ -296,7 +296,7 @@ def _check_order(steps: Sequence[Step], where: str) -> None:
 
 
 class ScriptListener(Protocol):
-    """Who tells people how far a script is."""
+    """Listener to the progress of a script."""
 
     def step(self, name: str, at_most_s: float | None) -> None:
         """A step begins; it takes so long, or as long as it takes."""
@@ -480,7 +480,7 @@ class ScriptRun:
             )
 
     def _not_ready(self, snapshot: FleetSnapshot) -> dict[Hashable, str]:
-        """What keeps robots from taking off, in words, by what it is."""
+        """Obstacles to takeoff, in words, by what each is."""
         missing: dict[Hashable, str] = {}
         statuses = self._statuses(snapshot)
         for name in self.robots:
@@ -598,7 +598,7 @@ class ScriptRun:
         _require((yield request))
 
     def _require_of_flying(self, request: Takeoff | Start | RobotCommand) -> Procedure[None]:
-        """What fails because somebody has the fleet meanwhile is no failure of the script's."""
+        """Carry out a request; a failure is none if somebody else has the fleet meanwhile."""
         report = yield request
         if not report.done:
             snapshot = yield from fresh_snapshot(self._ground)
@@ -667,7 +667,7 @@ def failures(report: CommandReport) -> str:
 
 
 def _asked(ground: GroundState | None, robot_id: int) -> str:
-    """What safety action is asked of a robot; who is not enabled is to hold."""
+    """Safety action that is asked of a robot; one that is not enabled is to hold."""
     if ground is None:
         return "none"
     safety_action = ground.safety_action_for(robot_id)

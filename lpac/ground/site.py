@@ -183,7 +183,7 @@ class OnPad(NamedTuple):
 
 
 def assign(places_m: Mapping[str, Point], pads_m: Mapping[int, Point]) -> dict[str, OnPad]:
-    """Who stands at which pad: robots by name, pads by the number of their slot's height.
+    """Assign robots, by name, to pads, by the number of their slot's height.
 
     Every robot is at the pad nearest to it, which is the matching of the least total distance as
     long as no pad is anybody else's. Raises ValueError, one line for all robots, if a robot is
@@ -308,7 +308,7 @@ def places_at(site: "SavedSite", setup: FleetSetup, robots: Iterable[str]) -> di
 
 
 def wide_fence(configured: Fence) -> Fence:
-    """What is left of a fence that is off: a square around the origin; the heights stay."""
+    """Fence while it is off: a square around the origin; the heights stay."""
     half_m = WIDE_FENCE_M / 2.0
     corners = ((-half_m, -half_m), (half_m, -half_m), (half_m, half_m), (-half_m, half_m))
     return Fence(corners, configured.buffer_m, configured.floor_m, configured.ceiling_m)

@@ -1,4 +1,4 @@
-"""What robots speak with: one small interface, and an adapter for each middleware."""
+"""Middleware of robots: one small interface, and an adapter for each."""
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence

@@ -55,7 +55,7 @@ _LOOPBACK = """<CycloneDDS><Domain><General>
 
 @dataclass
 class Bytes(IdlStruct):  # type: ignore[misc]
-    """What a message is to DDS."""
+    """Message as a DDS type."""
 
     data: sequence[uint8]
 

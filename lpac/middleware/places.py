@@ -54,7 +54,7 @@ def place_in(namespace: str) -> NetworkPlace:
 
 
 class News:
-    """What waits for lines of several programs."""
+    """Condition to wait on for lines of several programs."""
 
     def __init__(self) -> None:
         self._changed = Condition()

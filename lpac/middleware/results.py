@@ -1,4 +1,4 @@
-"""What runs came to: messages that were sent and heard, and runs of one kind together. Pure."""
+"""Results of runs: messages sent and heard, and summaries of runs of one kind. Pure."""
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,7 +33,7 @@ class Reception(NamedTuple):
 
 
 class CountedTime(NamedTuple):
-    """What programs of that start, the fleet's, said within a time."""
+    """Messages that programs of that start, the fleet's, sent within a time."""
 
     start: int
     from_s: float
@@ -42,7 +42,7 @@ class CountedTime(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """What became of messages.
+    """Fate of messages.
 
     `delivered` is the share that arrived, of one for each other robot; `ages_s` how old each was
     when it did. `heard_s` has for each window and pair of robots how long after the window began

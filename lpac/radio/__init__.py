@@ -1,1 +1,1 @@
-"""What a fleet's radio can carry."""
+"""Capacity of a fleet's radio."""

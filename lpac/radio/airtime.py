@@ -107,7 +107,7 @@ class Wifi(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Traffic(Bounded):
-    """What a fleet says in flight; sizes are those of sealed messages, before any framing.
+    """Traffic of a fleet in flight; sizes are those of sealed messages, before any framing.
 
     `message_bytes` and `message_hz` are of what a robot tells its neighbours, `status_hz` of what
     it tells the ground. `neighbours` is how many robots' messages and cards a robot is sent on
@@ -157,7 +157,7 @@ class LinkQuality(NamedTuple):
 
 
 def airtime(transport: Transport, wifi: Wifi, traffic: Traffic) -> Airtime:
-    """What the fleet's traffic takes of the channel's time.
+    """Airtime of the fleet's traffic.
 
     Raises ValueError for another transport, and for a mesh with guests: it ends at its channel.
     """
@@ -232,7 +232,7 @@ def cells(
 
 
 def link_quality(transport: Transport, wifi: Wifi, traffic: Traffic) -> LinkQuality:
-    """What a robot's message to another suffers: `lpac.sim.medium.Medium` takes the two.
+    """Loss and delay of a robot's message to another: `lpac.sim.medium.Medium` takes the two.
 
     A message waits as in a queue of random arrivals and equal jobs (Pollaczek and Khinchine), a job
     being one message to all its receivers. What waits for one receiver is sent together, which
@@ -311,14 +311,14 @@ _TCP_ACK = _Packets(1.0, _TCP_IP_BYTES)
 
 
 def _segments(payload_bytes: float) -> _Packets:
-    """What a message becomes over TLS and TCP."""
+    """Packets of a message over TLS and TCP."""
     total_bytes = payload_bytes + _ZENOH_BYTES + _TLS_BYTES
     count = math.ceil(total_bytes / (_MTU_BYTES - _TCP_IP_BYTES))
     return _Packets(count, total_bytes / count + _TCP_IP_BYTES)
 
 
 def _datagrams(payload_bytes: float) -> _Packets:
-    """What a message becomes in a multicast group."""
+    """Packets of a message in a multicast group."""
     count = math.ceil(payload_bytes / PART_BYTES)
     around_bytes = DATAGRAM_BYTES - PART_BYTES + _UDP_BYTES + _IP_BYTES
     return _Packets(count, payload_bytes / count + around_bytes)
@@ -438,7 +438,7 @@ def _data_us(packet_bytes: float, rate_mbit_s: float) -> float:
 
 
 class _Flow(NamedTuple):
-    """What `senders` say on a topic, each so often, to so many robots, and to the ground or not."""
+    """Messages of `senders` on a topic: how often, to how many robots, and if to the ground."""
 
     topic: str
     source: Literal["robot", "ground", "wire"]
@@ -508,7 +508,7 @@ def _share(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow) -> 
 
 
 def _message_us(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow) -> _Use:
-    """What one message of a flow takes, to all that hear it."""
+    """Airtime of one message of a flow, to all that hear it."""
     if transport == "multicast" and flow.robots and flow.source != "ground":
         in_group = _multicast_us(wifi, channel, flow)
         if not flow.to_ground:

@@ -1,4 +1,4 @@
-"""What a field said in place of what the model assumes.
+"""Calibration of the radio model by a field's own records.
 
 `read_wifi` takes a TOML file of `Wifi` values, or a file of a field's `RadioRecord`s, from which
 `calibrated` takes what they can say:
@@ -42,7 +42,7 @@ _ROUNDS = 3
 
 
 class SourceKind(StrEnum):
-    """What a value of `Wifi` comes from."""
+    """Origin of a value of `Wifi`."""
 
     ASSUMED = "assumed"
     FILE = "file"
@@ -98,7 +98,7 @@ def read_wifi(path: Path | None) -> Calibration:
 
 
 def calibrated(records: Sequence[RadioRecord], assumed: Wifi | None = None) -> Calibration:
-    """What the records say, in place of what is `assumed`: if not given, what `Wifi` has."""
+    """Calibrate by records, from what is `assumed`: if not given, what `Wifi` has."""
     wifi, sources = assumed or Wifi(), dict[str, Source]()
     # What a bulk stream takes of the channel, and does to messages, is not in the model.
     records = [each for each in records if not each.loaded]

@@ -1,4 +1,4 @@
-"""What a check of the radio looked at, and what of it is kept."""
+"""Measurements of a check of the radio, and the records that are kept."""
 
 import math
 import statistics
@@ -11,7 +11,7 @@ from lpac.radio.records import RadioRecord
 
 
 class WifiReading(NamedTuple):
-    """What a robot's radio told; None where it did not.
+    """Readings of a robot's radio; None where it told none.
 
     At which rate it sends, how strong it hears, and the share of the channel's time in which it
     heard anybody send.
@@ -43,7 +43,7 @@ class Checked(NamedTuple):
 
     @property
     def traffic(self) -> Traffic | None:
-        """What those that spoke said, sealed, on average; None if nobody did."""
+        """Mean traffic, sealed, of those that spoke; None if nobody did."""
         speaking = [window for window in self.windows.values() if window.sent > 0]
         if not speaking:
             return None

@@ -1,4 +1,4 @@
-"""Who hears whom, as a picture: the share that was lost, and how old the rest was."""
+"""Heat map of links: the share that was lost, and how old the rest was."""
 
 import textwrap
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What each robot heard of each other over some time, by what they say of themselves.
+"""Links between robots over some time, by their own statuses.
 
 Robots count for themselves what arrives and how old it is (`edge.core.arrivals`); here two of a
 robot's statuses are compared. Nobody has to be asked anything.
@@ -48,7 +48,7 @@ class Window(NamedTuple):
 
     @property
     def bytes_sent(self) -> int:
-        """What these had together, without envelopes."""
+        """Bytes of these together, without envelopes."""
         first, last = self.counts
         return last.sent_bytes - first.sent_bytes
 
@@ -58,7 +58,7 @@ class Window(NamedTuple):
         return self.sent / self.duration_s if self.duration_s > 0.0 else 0.0
 
     def arrivals(self, sender: int) -> Arrivals:
-        """What came of a robot, by its id."""
+        """Arrivals of a robot's messages, by its id."""
         first, last = (
             Arrivals.of_counts(counts.arrivals.get(str(sender), ())) for counts in self.counts
         )
@@ -136,7 +136,7 @@ class Blame(NamedTuple):
 
 
 def blame(is_good: Mapping[Link, bool]) -> Blame:
-    """What few robots explain of bad links, among all links that there should be."""
+    """Explain bad links by few robots, among all links that there should be."""
     left = {link for link, good in is_good.items() if not good}
     found: tuple[list[str], list[str]] = [], []  # senders, receivers
     while True:

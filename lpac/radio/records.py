@@ -1,4 +1,4 @@
-"""What a field said of its radio: JSON lines, one for each ordered pair and measurement."""
+"""Records of a field's radio: JSON lines, one for each ordered pair and measurement."""
 
 import json
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ _Name = Annotated[str, Meta(min_length=1, description="a name")]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadioRecord(Bounded):
-    """What `receiver` heard of `sender` while `robots` of them spoke; None: it is not known.
+    """Link from `sender` to `receiver` while `robots` of them spoke; None: it is not known.
 
     `sender_heading_deg` is the true heading of the sender's nose, clockwise from north, and
     `receiver_height_m` above its own takeoff point. Of `sent` messages of `message_bytes`, sealed,

@@ -1,4 +1,4 @@
-"""What a check of the radio comes to: one sentence, and what is wrong, the worst first."""
+"""Verdict of a check of the radio: one sentence, and what is wrong, the worst first."""
 
 import dataclasses
 import math

@@ -19,7 +19,7 @@ GROUND = -1
 
 @dataclass(frozen=True, slots=True)
 class Air(Bounded):
-    """What becomes of messages. Any of it may be replaced while it is used.
+    """Faults of the radio. Any of them may be replaced while it is used.
 
     From one sender to one receiver a message is lost with probability `loss`, arrives twice with
     `duplication`, with one bit flipped with `corruption`, and travels `delay_s` on average,
@@ -81,7 +81,7 @@ class Radio:
         return link
 
     def suspend(self, station: int, duration_s: float) -> None:
-        """What comes to that station's programs within that time waits until it is over."""
+        """Delay until then all that comes to that station's programs."""
         for link in self._links:
             if link.station == station:
                 link.suspended_until_s = self.schedule.monotonic_s() + duration_s
@@ -91,7 +91,7 @@ class Radio:
         self._links.remove(link)
 
     def others(self, link: "RadioLink") -> frozenset[int]:
-        """What all other links say that they are."""
+        """Stations of all other links."""
         return frozenset(other.station for other in self._links if other is not link)
 
     def send(self, sender: "RadioLink", topic: Topic, data: bytes) -> None:

@@ -118,7 +118,7 @@ class DecentralizedCvt:
 
 
 class SharedMaps:
-    """What robots have seen that tell each other everything, at once, also through others.
+    """Joint map of robots that tell each other everything, at once, also through others.
 
     They see and talk at each `sense`; who has seen something, has it for ever.
     """
@@ -144,7 +144,7 @@ class SharedMaps:
                 self._others[robot] = group[group != robot]
 
     def others(self, robot: int) -> npt.NDArray[np.intp]:
-        """Whom the robot can reach now, also through others."""
+        """Robots that this one can reach now, also through others."""
         return self._others[robot]
 
     def around(self, robot: int, position: F64) -> tuple[F32, Bools, tuple[int, int]]:

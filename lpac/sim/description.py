@@ -1,4 +1,4 @@
-"""What the fleet.toml of a simulated fleet says of all its robots: the field, and how they fly."""
+"""A simulated fleet's fleet.toml, as far as it is the same for all robots: field and flight."""
 
 import math
 from dataclasses import asdict

@@ -159,7 +159,7 @@ class Scenario(Bounded):
 
     @property
     def link(self) -> LinkQuality:
-        """What messages suffer, as it was asked for, or by the model."""
+        """Loss and delay of messages, as they were asked for, or by the model."""
         if self.radio is None:
             return LinkQuality(self.loss, self.delay_s)
         return self.radio.link(self.robots, self.payload, 1.0 / self.clocks.policy_s)

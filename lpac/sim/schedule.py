@@ -58,12 +58,12 @@ class WallClock:
         return self._schedule.monotonic_s()
 
     def unix_s(self) -> float:
-        """What this computer takes the time to be."""
+        """Time on this computer's clock."""
         return self._schedule.unix_s() + self.ahead_s
 
 
 class Recurrence:
-    """What a schedule does again and again, next at `due_s`."""
+    """Task that a schedule repeats, next at `due_s`."""
 
     def __init__(
         self, schedule: Schedule, period_s: float, do: Callable[[], object], due_s: float

@@ -25,11 +25,11 @@ from lpac.sim.vehicles import PointVehicles, VehicleOdometry
 
 
 class Saying(Protocol):
-    """What a robot's policy did."""
+    """Result of a robot's policy."""
 
     @property
     def message(self) -> Any:
-        """What its neighbours are sent."""
+        """Message to its neighbours."""
 
 
 class SwarmRobot(Protocol):

@@ -1,4 +1,4 @@
-"""What came of a run, for people: a model card, with its figures."""
+"""Model card of a run, with its figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What `lpac train` is told: a TOML file, as frozen dataclasses. Units are the model's, and s."""
+"""Configuration of `lpac train`: TOML, as frozen dataclasses. Units are the model's, and s."""
 
 import hashlib
 import tomllib
@@ -87,7 +87,7 @@ class WorldRanges(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disturbances(Bounded):
-    """What goes wrong in flights; each draws from [least, greatest].
+    """Faults in training flights; each draws from [least, greatest].
 
     `loss` is the probability with which a message is lost, `delay_s` its way, `lag_s` the time
     constant with which velocities follow, `position_bias` the standard deviation of each robot's
@@ -197,7 +197,7 @@ class SelectConfig(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportConfig(Bounded):
-    """What the policy is called, and under what licence it is."""
+    """The policy's name and licence."""
 
     name: FileName
     licence: str = "MIT"
@@ -219,7 +219,7 @@ class TrainingConfig(Bounded):
 
     @property
     def parameters(self) -> PolicyParameters:
-        """What the bundle says that the policy was trained with."""
+        """Training parameters for the bundle."""
         return PolicyParameters(self.perception, self.training)
 
 

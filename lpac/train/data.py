@@ -30,7 +30,7 @@ class Shards:
 
     @property
     def facts(self) -> dict[str, dict[str, Any]]:
-        """What the manifest says of each shard that is there, by name."""
+        """Manifest entry of each shard that is there, by name."""
         lines = {line["shard"]: line for line in self._kept.lines}
         return {name: line for name, line in lines.items() if self._path(name).exists()}
 

@@ -1,4 +1,4 @@
-"""Who is imitated: experts that know where all robots truly are.
+"""Experts to imitate, which know where all robots truly are.
 
 Most know the whole world, too. What such a one does where a robot has seen nothing cannot be
 learned, only its mean: to stay about where one is. "exploring-cvt" knows what all robots together

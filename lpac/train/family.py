@@ -1,4 +1,4 @@
-"""What a policy family has to offer so that it can be trained; nothing here knows a network.
+"""Interface of a policy family that can be trained; nothing here knows a network.
 
 An installed package adds a family by an entry point of the group `lpac_edge.learnable`, named as
 the family of its bundles: see `edge.drivers.registry`. `lpac.train.lpac` is the paper's.
@@ -45,7 +45,7 @@ class Learnable(Protocol):
 
     @property
     def task(self) -> "Task":
-        """What it is trained for."""
+        """Task that it is trained for."""
 
     def module(self, actions_mean: F32, actions_std: F32) -> "torch.nn.Module":
         """A new `TrainableModule`, drawn from torch's generator.
@@ -64,7 +64,7 @@ class Learnable(Protocol):
         """All that in a world that is mirrored or turned: `turned` is 0 (as it is) to 7."""
 
     def checkpoint(self, state: StateDict) -> bytes:
-        """What a module's state dict is as a file."""
+        """Serialise a module's state dict, as the family's files have it."""
 
     def bundle(
         self,

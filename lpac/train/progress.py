@@ -9,7 +9,7 @@ Stage = Literal["generate", "fit", "select", "export"]
 
 
 class RunProgress(NamedTuple):
-    """What a run does now.
+    """Present stage of a run.
 
     `done` is the share of all its work; `loss` that of the newest epoch, `cost` the least mean
     closed-loop cost so far. `left_s` is None as long as nobody knows.
@@ -49,7 +49,7 @@ class Work:
         self._done[stage] += units
 
     def begin(self) -> None:
-        """What is done from now on is timed."""
+        """Time the work from now on."""
         self._since = self._clock()
 
     def add(self, stage: Stage, round_: int, units: float) -> None:

@@ -202,7 +202,7 @@ class _Deciding:
         return self
 
     def watch(self, flights: BatchedFlights, experts: Sequence[Teacher]) -> None:
-        """What the experts know; before anybody decides."""
+        """Take the flights and the experts, before anybody decides."""
         self._flights = flights
         self._experts = experts
         for world, prepared in enumerate(flights.prepared):

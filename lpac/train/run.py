@@ -124,7 +124,7 @@ class TrainingRun:
                 work.add("generate", round_, _robot_seconds(shard))
 
     def _flying(self, round_: int) -> Bundle:
-        """Who flies in a round: at first nobody does, but all perceive as this bundle says."""
+        """Bundle that flies in a round: at first none does, but all perceive as this one says."""
         if round_:
             return load_bundle(self._of(self._candidates(round_ - 1)[-1]) / _BUNDLE)
         checkpoint = self._network.checkpoint(self._fit.untrained())

@@ -120,7 +120,7 @@ class Selection:
 
     @property
     def seconds(self) -> float:
-        """What judging took."""
+        """Time that judging took."""
         return float(sum(line["seconds"] for line in self._kept.lines))
 
     def judge(

@@ -1,4 +1,4 @@
-"""What a family's networks are trained for: who is imitated, and what a good flight is.
+"""Training task of a family: its expert, and what a good flight is.
 
 Processes that fly have it, so that this module, and a task's own, load no torch.
 """
@@ -15,7 +15,7 @@ from lpac.train.expert import Expert, make_expert
 
 
 class Teacher(Protocol):
-    """Who is imitated in one world; it knows where all robots truly are, and how they move."""
+    """Expert in one world; it knows where all robots truly are, and how they move."""
 
     def look(self, positions: F64, alive: Bools) -> None:
         """Take notice of what the robots at `positions` (N, 2) see that are left."""
@@ -27,7 +27,7 @@ class Teacher(Protocol):
         robots: Sequence[int] | None = None,
         moving: F64 | None = None,
     ) -> F64:
-        """What `robots` (m,), or all N, should fly: (m, 2); 0 of who is not left.
+        """Velocities that `robots` (m,), or all N, should fly: (m, 2); 0 of those not left.
 
         They are at true positions (N, 2) and fly `moving` (N, 2), in model units and model units/s;
         None: they stand.
@@ -35,17 +35,17 @@ class Teacher(Protocol):
 
 
 class Task(Protocol):
-    """What networks are trained for: whom they imitate, and what a good flight is.
+    """Training task: the expert that networks imitate, and what a good flight is.
 
     Can be pickled.
     """
 
     @property
     def baselines(self) -> Sequence[BaselineName]:
-        """What policies are held against in the model card, over the same worlds; may be none."""
+        """Baselines in the model card, over the same worlds; may be none."""
 
     def expert_name(self, data: DataConfig) -> str:
-        """Who is imitated, for the model card."""
+        """Name of the expert, for the model card."""
 
     def teacher(self, data: DataConfig, world: Preparation) -> Teacher:
         """A new one, for that world."""

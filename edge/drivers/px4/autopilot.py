@@ -56,7 +56,7 @@ _FENCE = 1  # MAV_MISSION_TYPE
 
 
 class AutopilotError(OSError):
-    """What the autopilot did not do, in one line."""
+    """A command that the autopilot did not carry out, in one line."""
 
 
 class _UploadedFence(NamedTuple):

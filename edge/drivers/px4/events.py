@@ -415,14 +415,14 @@ class _Check(NamedTuple):
 
 
 class _Told(NamedTuple):
-    """What was told once."""
+    """An event that is told once."""
 
     at_s: float
     reason: AutopilotReason
 
 
 class Px4Events:
-    """What one vehicle's events say now. Times are the robot's monotonic clock, s."""
+    """State of one vehicle's events. Times are the robot's monotonic clock, s."""
 
     def __init__(self) -> None:
         self._last: int | None = None
@@ -486,12 +486,12 @@ class Px4Events:
         return _reasons(errors or checks)
 
     def told(self, since_s: float) -> tuple[AutopilotReason, ...]:
-        """What PX4 warned of once since then, the newest first."""
+        """Warnings of PX4 since then that are told once, the newest first."""
         recent = takewhile(lambda told: told.at_s >= since_s, reversed(self._told))
         return _reasons(recent)
 
     def wrong(self, mode: Mode | None) -> tuple[AutopilotReason, ...]:
-        """What PX4 finds wrong now that concerns this mode, the gravest first."""
+        """Present problems, as PX4 finds them, that concern this mode, the gravest first."""
         if mode not in self._wrong:
             bits = _bits(mode)
             grave = (c for c in self._checks if c.level <= _WARNING and c.modes & bits)

@@ -36,7 +36,7 @@ class Heartbeat(NamedTuple):
 
 
 def mode_name(custom_mode: int) -> str:
-    """What PX4's custom mode is called; "other" for one that nobody needs to tell apart."""
+    """Name of PX4's custom mode; "other" for one that nobody needs to tell apart."""
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     return (_AUTO_MODES.get(sub) if main == _AUTO else _MAIN_MODES.get(main)) or "other"
 

@@ -1,4 +1,4 @@
-"""What PX4 says, as one `VehicleState`: MAVLink messages in; no socket, thread or clock.
+"""PX4's telemetry as one `VehicleState`: MAVLink messages in; no socket, thread or clock.
 
 Messages come as MAVLink's common dialect names them, with their fields in MAVLink's units.
 """

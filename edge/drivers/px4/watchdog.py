@@ -148,7 +148,7 @@ def _watch(
 
 
 def _peer(udp: socket.socket) -> tuple[str, int] | None:
-    """Who sent the next datagram, which stays for the robot's program to read."""
+    """Sender of the next datagram, which stays for the robot's program to read."""
     try:
         _, address = udp.recvfrom(_DATAGRAM_BYTES, socket.MSG_PEEK | socket.MSG_DONTWAIT)
     except OSError:

@@ -1,4 +1,4 @@
-"""What the manifest of a bundle says that only this family understands."""
+"""Parts of a bundle's manifest that only this family understands."""
 
 from dataclasses import asdict, dataclass
 from typing import Literal
@@ -20,7 +20,7 @@ def gnn_graph(layer: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Images(Bounded):
-    """What the CNN takes and gives."""
+    """Inputs and outputs of the CNN."""
 
     channels: tuple[str, ...]
     size: AtLeastOne

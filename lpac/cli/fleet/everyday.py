@@ -44,7 +44,7 @@ _COLOURS = ("cyan", "magenta", "yellow", "green", "blue", "bright_cyan", "bright
 
 
 class _Deployed(NamedTuple):
-    """What came of a deployment, and how long it took."""
+    """Result of a deployment, and how long it took."""
 
     deployed: "Deployed"
     duration_s: float
@@ -118,7 +118,7 @@ def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJso
 
 
 class _Controlled(NamedTuple):
-    """What the robot has, its unit, and which open switch was settled before (None: none)."""
+    """The robot's release, its unit, and the open switch that was settled before (None: none)."""
 
     release: str | None
     service: dict[str, Any]
@@ -340,7 +340,7 @@ def _run_plainly(
 
 
 def _labels(robots: Sequence["RobotHost"]) -> dict[str, str]:
-    """What stands before each robot's lines."""
+    """Label before each robot's lines."""
     width = max(len(robot.name) for robot in robots)
     return {
         robot.name: typer.style(robot.name.ljust(width), fg=_COLOURS[n % len(_COLOURS)]) + "  "

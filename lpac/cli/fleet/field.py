@@ -89,7 +89,7 @@ def _verdict(verdict: str | None) -> "Text":
 
 
 def _print_findings(diagnoses: "Sequence[Diagnosis]") -> None:
-    """What is not well, the worst first; what several robots have in common, once."""
+    """Print the findings that are not well, the worst first; those of several robots once."""
     notes: list[tuple[str, str | Text]] = []
     for verdict in ("FAILED", "warning", "skipped"):
         found: dict[tuple[str, str], dict[str, str]] = {}
@@ -107,7 +107,7 @@ def _print_findings(diagnoses: "Sequence[Diagnosis]") -> None:
 
 
 def _print_multicast(config: "FleetConfig") -> None:
-    """What multicast costs."""
+    """Print the costs of multicast."""
     from lpac.fleet.up import group_costs
 
     for cost in group_costs(config):

@@ -75,7 +75,7 @@ def operator(
 
 
 def members(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
-    """Who has a card of the fleet, until when, and whose was revoked."""
+    """List the fleet's cards: whose they are, until when, and which were revoked."""
     from lpac.fleet.cards import open_authority
     from lpac.fleet.settings import load_fleet
 
@@ -136,7 +136,7 @@ def revoke(
 
 
 def _why_not_now(config: "FleetConfig", name: str) -> str:
-    """What speaks against it as far as this laptop's ground knows; "" if nothing does."""
+    """Reason against it as far as this laptop's ground knows; "" if there is none."""
     snapshot = _snapshot(config)
     if snapshot is None:
         return f"no `lpac ground` runs here, so nobody knows what {name} does now"
@@ -158,7 +158,7 @@ def _snapshot(config: "FleetConfig") -> "FleetSnapshot | None":
 
 
 def _flying(snapshot: "FleetSnapshot") -> list[str]:
-    """Who was heard in the air last."""
+    """Robots that were last heard in the air."""
     from lpac.ground.station.station import is_down
 
     return [r.name for r in snapshot.robots if r.status is not None and not is_down(r.status)]

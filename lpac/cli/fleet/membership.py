@@ -199,7 +199,7 @@ def _pulled_cells(value: "Pulled") -> tuple["str | Text", ...]:
 
 
 def _say(text: str) -> None:
-    """What is being done, on a terminal only; the next text takes its place."""
+    """Show the present step, on a terminal only; the next text takes its place."""
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{text[:78]}")
         sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""What a person sees while the same is done on many robots: a live table, then a summary."""
+"""Progress of the same task on many robots: a live table, then a summary."""
 
 import asyncio
 import json

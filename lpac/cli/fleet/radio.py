@@ -36,7 +36,7 @@ _NOT_TOLD = "not told by the radio"
 
 
 class _Heard(NamedTuple):
-    """What was measured, and what it means."""
+    """Measurement, and its verdict."""
 
     checked: "Checked"
     pairs: "Sequence[Pair]"
@@ -151,7 +151,7 @@ def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load:
 
 
 def _heard(snapshot: "FleetSnapshot", names: Sequence[str]) -> dict[str, "RobotStatus"]:
-    """What those of them say that are heard now."""
+    """Statuses of those of them that are heard now."""
     return {
         robot.name: robot.status
         for robot in snapshot.robots
@@ -287,7 +287,7 @@ def _print_verdict(heard: _Heard) -> None:
 
 
 def _basis(checked: "Checked", room: "Room") -> str:
-    """What the room for more comes from."""
+    """Describe the assumptions behind the room for more."""
     text = (
         f"room by the model of docs/scaling.md: {checked.transport} at {_rates(checked, room)}; "
         f"{room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a second take "

@@ -1,4 +1,4 @@
-"""What `lpac fleet status` shows of a robot, and in which words."""
+"""`lpac fleet status`: the state of each robot, and its wording."""
 
 import time
 from collections import Counter
@@ -186,7 +186,7 @@ def _failed(service: Mapping[str, Any]) -> bool:
 
 
 def _parts(versions: Mapping[str, Any] | None) -> str | None:
-    """What all robots of a fleet should have in common; None without a release."""
+    """Versions that all robots of a fleet should have in common; None without a release."""
     if versions is None:
         return None
     names = ("image", "bundle", "world")
@@ -194,7 +194,7 @@ def _parts(versions: Mapping[str, Any] | None) -> str | None:
 
 
 def _most_common(texts: Iterable[str]) -> str | None:
-    """What more than half are; None if nothing is."""
+    """Text of more than half of them; None if there is none."""
     counts = Counter(texts)
     return next((text for text, n in counts.items() if 2 * n > counts.total()), None)
 

@@ -69,7 +69,7 @@ class OnlyNamed(Named):
 
 
 def _named(of: Named) -> Addressed:
-    """Whom a command addresses that takes robots' names as well as --robots."""
+    """Resolve the robots of a command that takes their names as well as --robots."""
     if of.names and of.robots is not None:
         raise ValueError("give the robots' names or --robots, not both")
     return address(of.fleet, ",".join(of.names) if of.names else of.robots)

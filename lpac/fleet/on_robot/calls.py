@@ -21,7 +21,7 @@ _CALLS = {}  # type: Dict[str, Call]
 
 
 class Refused(Exception):
-    """What was asked cannot or must not be done; one line says why, and what to do."""
+    """A request that cannot or must not be carried out; one line says why, and what to do."""
 
 
 def call(function: Call) -> Call:
@@ -64,7 +64,7 @@ def reason(done: "subprocess.CompletedProcess[str]") -> str:
 
 
 def must(command: List[str], timeout_s: float = 60.0) -> str:
-    """What a program of the robot prints. Raises Refused unless it returns 0."""
+    """Output of a program of the robot. Raises Refused unless it returns 0."""
     done = run(command, timeout_s)
     if done.returncode != 0:
         raise Refused("%s: %s" % (" ".join(command), reason(done)))

@@ -1,4 +1,4 @@
-"""What a robot has of a trial, put together for the laptop to fetch, with checksums.
+"""A trial's files on a robot, put together for the laptop to fetch, with checksums.
 
 Large files are only linked to, so that nothing of them is copied on the robot; but those that may
 still grow are, so that what travels is what the checksums are of.

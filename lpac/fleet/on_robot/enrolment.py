@@ -1,4 +1,4 @@
-"""What is done once to a computer that becomes a robot of a fleet; each step may be repeated."""
+"""Enrolment of a computer as a robot of a fleet; each step may be repeated."""
 
 import base64
 import binascii

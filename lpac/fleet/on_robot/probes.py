@@ -1,4 +1,4 @@
-"""What the robot's computer has and does, as it is: facts only; the laptop judges them.
+"""Probes of the robot's computer: facts only; the laptop judges them.
 
 Nothing here changes anything, but `set_clock` and `renumber_starts`.
 """
@@ -175,7 +175,7 @@ def open_ports(text: str) -> List[Dict[str, Any]]:
 
 
 def _factory_passwords() -> List[str]:
-    """Who may log in with no password, or with the one that every VOXL comes with."""
+    """Users that can log in with no password, or with the one that every VOXL comes with."""
     found = []
     for line in _read("/etc/shadow").split("\n"):
         user, _, rest = line.partition(":")
@@ -207,7 +207,7 @@ def _settled(state: Dict[str, Any]) -> Dict[str, Any]:
 
 @call
 def vehicle_check(directory: str) -> Dict[str, Any]:
-    """What the release itself, while it does not run, says of the vehicle: `lpac robot check`.
+    """Check of the vehicle by the release itself, while it does not run: `lpac robot check`.
 
     With `parameters = "set"` in its configuration it sets PX4's parameters, as it would when run.
     Needs the lock, so that nobody starts the program meanwhile.
@@ -283,7 +283,7 @@ def _hottest_c() -> Optional[float]:
 
 @call
 def wifi() -> Dict[str, Any]:
-    """What the wireless interfaces tell, of their channels too."""
+    """State of the wireless interfaces, and of their channels."""
     return {"interfaces": _wifi()}
 
 
@@ -317,7 +317,7 @@ def wireless(text: str) -> Dict[str, Optional[float]]:
 
 
 def iw_link(text: str) -> Dict[str, Any]:
-    """What `iw dev NAME link` tells; `connected` is None if it tells nothing."""
+    """Parse `iw dev NAME link`; `connected` is None if it tells nothing."""
     connected = None  # type: Optional[bool]
     if re.search(r"^(Connected to|Joined IBSS)", text, re.MULTILINE):
         connected = True
@@ -446,7 +446,7 @@ def known_containers() -> Optional[List[Dict[str, Any]]]:
 
 
 def containers(text: str) -> List[Dict[str, Any]]:
-    """What `docker inspect` tells of containers, as far as it matters here. Raises ValueError."""
+    """Parse `docker inspect` of containers, as far as it matters here. Raises ValueError."""
     found = []
     for one in json.loads(text):
         host = one.get("HostConfig") or {}
@@ -472,7 +472,7 @@ def containers(text: str) -> List[Dict[str, Any]]:
 
 
 def _output(command: List[str]) -> str:
-    """What a program prints; nothing if it is not there, or does not end."""
+    """Output of a program; empty if it is not there, or does not end."""
     try:
         return run(command, timeout_s=5.0).stdout
     except (Refused, OSError):

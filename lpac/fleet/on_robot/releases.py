@@ -32,7 +32,7 @@ _lock = []  # type: List[int]
 
 @call
 def overview(directory: str) -> Dict[str, Any]:
-    """What is on the robot: its identity, releases, versions, unit, disk and clock."""
+    """State of the robot: its identity, releases, versions, unit, disk and clock."""
     current = linked(directory, "current")
     versions = _versions(directory, current)
     if versions is not None:
@@ -53,7 +53,7 @@ def overview(directory: str) -> Dict[str, Any]:
 
 
 def identity() -> Optional[Dict[str, Any]]:
-    """Who the robot was enrolled as, None if it was not."""
+    """Identity that the robot was enrolled with, None if it was not."""
     try:
         with open("/etc/lpac/robot.json") as file:
             found = json.load(file)

@@ -33,7 +33,7 @@ _PROPERTIES = (
 
 @call
 def service() -> Dict[str, Any]:
-    """What systemd knows of the unit, and the program's own last words (`status`, None if none).
+    """State of the unit by systemd, and the program's own last words (`status`, None if none).
 
     `fresh` tells whether the program is running and said so within the last seconds.
     """
@@ -108,7 +108,7 @@ def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dic
 
 
 def _datagram(packet: bytes, port: int) -> bytes:
-    """What an IPv4 packet carries to a UDP port; nothing if it is another packet."""
+    """Payload of an IPv4 packet to a UDP port; empty if it is another packet."""
     header = 4 * (packet[0] & 0x0F) if packet else 0
     if header < 20 or len(packet) < header + 8 or packet[9] != socket.IPPROTO_UDP:
         return b""

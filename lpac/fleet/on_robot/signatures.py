@@ -1,4 +1,4 @@
-"""Whose releases this robot takes: its fleet's authority's, and none older than it has had.
+"""Signatures of releases: only the fleet's authority's, and none older than the robot has had.
 
 A release's signature is a certificate that the authority made out to the sha256 of its manifest,
 with a serial number that only grows: that much OpenSSL 1.1.1 can check.

@@ -1,4 +1,4 @@
-"""What Foxglove is shown of a fleet: the ground's log, topic by topic, as Foxglove's own messages.
+"""A fleet in Foxglove: the ground's log, topic by topic, as Foxglove's own messages.
 
 Pure. What comes in is what `lpac.ground.record` writes, whether it happens now or was read from a
 file; so a flight looks the same live and afterwards. What goes out:
@@ -142,7 +142,7 @@ class FoxgloveView:
         self._fleet_at_s = self._still_at_s = -math.inf
 
     def take(self, topic: str, unix_time_s: float, logged: Mapping[str, object]) -> Iterator[Shown]:
-        """What is new with one message of the log. Raises ValueError if it is not the log's."""
+        """Messages that are new with one of the log. Raises ValueError if it is not the log's."""
         match topic:
             case "setup":
                 self._take_setup(_logged(FleetSetup, logged))
@@ -164,7 +164,7 @@ class FoxgloveView:
                 yield Shown("/log", unix_time_s, _event(event))
 
     def tick(self, unix_now_s: float) -> Iterator[Shown]:
-        """What is due by now, however little has happened."""
+        """Messages that are due by now, however little has happened."""
         if self._setup is None:
             return
         # The clock may be set.

@@ -88,7 +88,7 @@ _ACTIONS: dict[str, Callable[[tuple[str, ...]], Request]] = {
 
 
 class Outbox:
-    """What one open page is still to be told: of each kind the newest alone, and the last events.
+    """Queue of one open page: of each kind the newest message alone, and the last events.
 
     So a page that takes it slowly misses snapshots, and costs no memory.
     """

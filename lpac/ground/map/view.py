@@ -1,4 +1,4 @@
-"""What the live map's page is told, from what the ground tells: JSON values, few enough for 5 Hz.
+"""Messages to the live map's page, from the ground's: JSON values, few enough for 5 Hz.
 
 Pure. Positions are (x, y) or (x, y, z) in the mission frame, m; `yaw_rad` is clockwise from its y
 axis, as the map shows it.
@@ -30,7 +30,7 @@ _PATH_STEP_M = 0.15
 
 
 def setup_view(setup: FleetSetup, coverage: Coverage | None) -> Json:
-    """What seldom changes; no density without `coverage`, as of a world that is not known here."""
+    """Values that seldom change; no density without `coverage`, as of an unknown world."""
     return {
         "kind": "setup",
         "slots": [
@@ -130,7 +130,7 @@ def detail_view(setup: FleetSetup, robot: RobotSnapshot) -> Json:
 
 
 def report_view(action: str, report: CommandReport) -> Json:
-    """What came of an action."""
+    """Outcome of an action."""
     results = [{"done": result.done, **dataclasses.asdict(result)} for result in report.results]
     problem = report.problem and dataclasses.asdict(report.problem)
     said = {"done": report.done, "results": results, "problem": problem}

@@ -64,7 +64,7 @@ def command(
 
 @contextmanager
 def subscribe(fleet: str) -> Iterator[Iterator[ServerMessage]]:
-    """What the ground process tells from now on. Raises GroundError, also when it ends."""
+    """Messages of the ground process from now on. Raises GroundError, also when it ends."""
     with _connected(fleet, SUBSCRIBE) as answers:
         yield answers
 

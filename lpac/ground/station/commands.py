@@ -1,4 +1,4 @@
-"""What each request of a client does: it is stepped until every robot has done it, or has not.
+"""Commands of clients: each is stepped until every robot has done it, or has not.
 
 Pure, like the station: a command is a generator that looks at the station, changes what it wants,
 and yields whenever it has to wait for what comes next.
@@ -123,7 +123,7 @@ class CommandTask:
         self._end()
 
     def news(self) -> list[CommandProgress]:
-        """What became known since the last call."""
+        """Progress since the last call."""
         news, self._news = self._news, []
         return news
 
@@ -186,7 +186,7 @@ class CommandTask:
 
     @property
     def _open(self) -> list[str]:
-        """Whose result is not known yet."""
+        """Robots whose result is not known yet."""
         return [name for name in self.names if name not in self._results]
 
     def _say(self, robot: str, text: str) -> None:
@@ -800,7 +800,7 @@ _IN_FLIGHT = (Takeoff, Start, Resume, SafetyCommand)
 
 
 def _safety_action_of(request: Request) -> str:
-    """What it asks the robots for again, if the same was asked already."""
+    """Safety action of a request; "" if it is of another kind."""
     return request.action if isinstance(request, SafetyCommand) else ""
 
 
@@ -889,7 +889,7 @@ def _is_home(flown: RobotStatus, status: RobotStatus) -> bool:
 
 
 def _why(status: RobotStatus) -> tuple[ResultCode, str]:
-    """What keeps a robot from what it was told, and what helps."""
+    """Explain why a robot does not do what it was told, and what helps."""
     text = _state_in_words(status)
     if status.state is _S.PILOT:
         return _C.WRONG_STATE, f"{text}; `lpac mission rejoin` takes it back"

@@ -1,4 +1,4 @@
-"""What `lpac ground` needs to know of its fleet."""
+"""Configuration of `lpac ground`."""
 
 import time
 from collections.abc import Callable
@@ -33,7 +33,7 @@ class GroundConfig:
 def load_ground(
     path: Path, operator: str | None, *, default_name: Callable[[], str] = lambda: ""
 ) -> GroundConfig:
-    """What the ground station needs to know of the fleet. Raises ValueError or OSError.
+    """Load the ground station's configuration of the fleet. Raises ValueError or OSError.
 
     In a fleet with keys its name is that of its card, and `operator` None or just that.
     """

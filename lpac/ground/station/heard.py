@@ -1,4 +1,4 @@
-"""What the robots of a fleet say of themselves, as a ground station hears it.
+"""Statuses of a fleet's robots, as a ground station hears them.
 
 Pure: time is passed in. Robots are kept by id and boot nonce, that is by the start of a program.
 """
@@ -57,7 +57,7 @@ class _ProgramStart:
         return True
 
     def recent(self) -> list[_HeardStatus]:
-        """What it said in the last few seconds, the newest last."""
+        """Its statuses of the last few seconds, the newest last."""
         newest_at_s = self.newest.at_s
         return [h for h in self.heard if newest_at_s - h.at_s <= _RATE_WINDOW_S]
 
@@ -195,7 +195,7 @@ class HeardRobots:
         return self._robots[robot_id].duplicate
 
     def snapshots(self, now_s: float) -> tuple[RobotSnapshot, ...]:
-        """What is known of each, in the fleet's order."""
+        """State of each, in the fleet's order."""
         return tuple(robot.snapshot(now_s) for robot in self._robots.values())
 
 

@@ -43,7 +43,7 @@ _EARLY_S = 0.1
 
 
 class GroundListener(Protocol):
-    """Who is told what happens at a ground."""
+    """Listener to the events at a ground."""
 
     def told(self, message: ServerMessage) -> None:
         """Something new that clients want to hear: a setup, an event, what was explored."""
@@ -83,21 +83,21 @@ class GroundNode:
 
     @property
     def subscriptions(self) -> Mapping[Topic, ReceiveCallback]:
-        """What it hears: topic -> callback with the key and the data, in the node's thread."""
+        """Subscriptions: topic -> callback with the key and the data, in the node's thread."""
         topics = (STATUS, EXPLORED, STATE, WORLD)
         return self._guard.subscriptions(dict.fromkeys(topics, self._hear))
 
     def attach(self, link: Link) -> None:
-        """What it says goes there from now on."""
+        """Set the link to publish on from now on."""
         self._link = self._guard.over(link)
 
     def detach(self) -> None:
-        """What it says goes nowhere from now on."""
+        """Publish nothing from now on."""
         self._link = None
 
     @property
     def explored(self) -> tuple[Explored, ...]:
-        """What each robot has explored, as far as it was heard."""
+        """Explored map of each robot, as far as it was heard."""
         return tuple(_explored(name, cells) for name, cells in self._explored.items())
 
     @property

@@ -1,4 +1,4 @@
-"""What the ground process and its clients say to each other, and its JSON.
+"""Protocol between the ground process and its clients, and its JSON.
 
 The ground process (`lpac ground`) alone speaks to the fleet. Its clients (commands, views, scripts)
 connect to its Unix socket and send one line: a command, or `SUBSCRIBE`. Each line of the answer
@@ -54,7 +54,7 @@ class SetFence:
 
 @dataclass(frozen=True, slots=True)
 class SetWorld:
-    """What the virtual sensors see: a CoverageControl world file's text, and how it is called.
+    """World of the virtual sensors: a CoverageControl world file's text, and its name.
 
     Refused while one of the robots is armed.
     """
@@ -79,7 +79,7 @@ class SetWorld:
 
 @dataclass(frozen=True, slots=True)
 class SetPlaces:
-    """Who flies and lands where, by the robots' names; all others stay where they are.
+    """Slots of robots, by their names; all others stay where they are.
 
     Who sat in one of these slots sits in none. Refused while one of the robots is armed.
     """
@@ -187,7 +187,7 @@ class CommandProgress:
 
 
 class ResultCode(StrEnum):
-    """What came of a command for one robot."""
+    """Outcome of a command for one robot."""
 
     DONE = "done"
     NOT_HEARD = "not_heard"
@@ -207,7 +207,7 @@ class ResultCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RobotResult:
-    """What one robot did; `text` is how, or why not. `refusal` is of an order that it refused."""
+    """Result of one robot; `text` is how, or why not. `refusal` is of an order that it refused."""
 
     robot: str
     code: ResultCode

@@ -160,7 +160,7 @@ class GroundProcess:
                 client.send(line)
 
     def stepped(self) -> None:
-        """Who waits for a command looks again."""
+        """Wake the clients that wait for a command."""
         self._stepped.set()
         self._stepped.clear()
 

@@ -1,4 +1,4 @@
-"""What a ground station wants of its fleet, and who commands it.
+"""A ground station: its wishes for its fleet, and who commands it.
 
 Pure: time is passed in, messages are handed in, and what is to be published is asked for. One
 thread at a time.
@@ -159,7 +159,7 @@ class Station:
 
     @property
     def commander(self) -> str:
-        """Who commands, or did last; "" if nobody does yet."""
+        """Station that commands, or did last; "" if none does yet."""
         if self.state is not None:
             return self.state.operator
         named: dict[str, list[int]] = {}
@@ -351,7 +351,7 @@ class Station:
         self.state, self._decided = None, True
 
     def _ahead_of(self, state: GroundState) -> list[RobotStatus]:
-        """Who has obeyed something beyond that state for a while."""
+        """Robots that have obeyed something beyond that state for a while."""
         return [
             status
             for robot, status in self.statuses().items()
@@ -521,7 +521,7 @@ class Station:
         return max(statistics.median_low(obeyed), 0) if obeyed else 0
 
     def _known_state(self) -> GroundState:
-        """What the fleet is told, by whoever was heard, or as it is remembered or seen."""
+        """State of the fleet: as last heard, remembered, or seen in the robots."""
         if self.state is not None:
             return self.state
         obeyed = [(s.obeyed_sequence, s.operator) for s in self.statuses().values() if s.operator]
@@ -531,11 +531,11 @@ class Station:
         return self._state_of_robots()
 
     def remember(self, state: GroundState) -> None:
-        """What the last process said: it counts if robots still obey just that."""
+        """Take the last process's state: it counts if robots still obey just that."""
         self._remembered = state
 
     def _state_of_robots(self) -> GroundState:
-        """What the robots were told by a station that is not heard, as far as they show it."""
+        """State by a station that is not heard, as far as the robots show it."""
         statuses = [s for s in self.statuses().values() if s.operator]
         idle = {str(s.robot_id): False for s in statuses if s.state is _S.IDLE}
         # Who is not heard yet may be in the air.
@@ -649,7 +649,7 @@ class Station:
             self._asked = None
 
     def _bring_home(self) -> None:
-        """Who returns and is over its landing point waits while somebody lower still flies home."""
+        """Keep robots over their landing points waiting while somebody lower still flies home."""
         state = self.state
         assert state is not None
         asked_home = {r for r in self._robots.names if state.safety_action_for(r) == "return"}
@@ -792,7 +792,7 @@ class Station:
 
 
 def changes_in_words(before: GroundState, after: GroundState) -> list[str]:
-    """What the ground wants that it did not want before, for people."""
+    """Describe what the ground newly wants, for people."""
     words: list[str] = []
     if (before.safety_action, before.robot_safety_actions) != (
         after.safety_action,
@@ -841,7 +841,7 @@ def _hears_ground(status: RobotStatus) -> bool:
 
 
 def _commonest(values: Iterable[T | None]) -> T | None:
-    """What most say, of those that say anything; of equals the first."""
+    """Value of most of those that have one; of equals the first."""
     said = Counter(value for value in values if value)
     return next((value for value, _ in said.most_common(1)), None)
 

@@ -1,4 +1,4 @@
-"""What the ground tells, kept for programs that go step by step."""
+"""Subscriber to the ground, for programs that go step by step."""
 
 import threading
 import time
@@ -51,7 +51,7 @@ class GroundSubscriber:
 
     @property
     def setup(self) -> FleetSetup:
-        """What seldom changes."""
+        """The fleet's setup, which seldom changes."""
         assert self._setup is not None
         return self._setup
 

@@ -114,7 +114,7 @@ class Lines(ScrollView):
 
 
 class _Question(NamedTuple):
-    """What is done if the answer is y."""
+    """A question, and the request that is sent if the answer is y."""
 
     text: str
     word: str
@@ -122,7 +122,7 @@ class _Question(NamedTuple):
 
 
 class _Entered(NamedTuple):
-    """What an event of a robot's new state tells of it."""
+    """Describe an event of a robot's new state."""
 
     state: FlightState
     trial: str
@@ -422,7 +422,7 @@ def _flying(snapshot: FleetSnapshot) -> bool:
 
 
 def _of_events() -> MissionTracker:
-    """Who flies on says nothing there."""
+    """Tracker over events, in which a robot that flies on says nothing."""
     return MissionTracker(silent_s=math.inf)
 
 

@@ -220,7 +220,7 @@ def _fact(name: str, text: str, width: int, style: TextStyle = "") -> list[Line]
 
 
 def _neighbour_table(row: Row, status: RobotStatus) -> list[Line]:
-    """Whose messages it gets, at which rate, and how old the last ones are."""
+    """Senders that it hears, at which rate, and how old their last messages are."""
     names = {str(robot_id): name for name, robot_id in row.setup.robots.items()}
     known = {*status.neighbour_messages, *status.neighbour_ages_s}
     lines: list[Line] = [(Span("neighbour messages   Hz   s", "faint"),)]

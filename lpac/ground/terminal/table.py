@@ -87,7 +87,7 @@ def _widened(column: Column, by: int) -> Column:
 
 
 def heading(shown: Sequence[Column]) -> tuple[Line, Line]:
-    """What stands above the columns: what they are, and their units.
+    """Headings of the columns, with their units.
 
     A column without a name of its own shares that of the columns before it.
     """

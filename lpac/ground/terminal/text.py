@@ -1,4 +1,4 @@
-"""What `lpac watch` says above and below its table; nothing here has a clock or a terminal."""
+"""Text of `lpac watch` above and below its table; nothing here has a clock or a terminal."""
 
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
@@ -199,7 +199,7 @@ def lost(setup: FleetSetup | None, text: str, lost_s: float, width: int) -> list
 
 
 def outcome(word: str, report: CommandReport) -> Span:
-    """Who did it, and first who did not and why."""
+    """Results of a command, failures first, with why."""
     if report.problem is not None:
         return Span(f"{word} NOT DONE: {report.problem.text}", "critical")
     who: dict[tuple[bool, str], list[str]] = {}
@@ -220,7 +220,7 @@ def _whom(names: Sequence[str], report: CommandReport) -> str:
 def all_of_it(
     setup: FleetSetup, snapshot: FleetSnapshot, alarms: Sequence[Alarm], width: int
 ) -> str:
-    """What the view shows of a fleet, as plain text."""
+    """The whole view of a fleet, as plain text."""
     shown = columns(setup, width)
     rows = in_order(setup, snapshot, alarms)
     lines = [

@@ -30,7 +30,7 @@ class PolicyFailedError(ArithmeticError):
 
 
 class PolicySteps(NamedTuple):
-    """What n robots do next: see `edge.policy.family.PolicyStep`.
+    """Next step of n robots: see `edge.policy.family.PolicyStep`.
 
     `velocities` is (n, 2), `payloads` (n, message_size).
     """
@@ -51,10 +51,10 @@ class Agents(Protocol):
         """The number of floats in a payload."""
 
     def inputs(self, robot: int, observation: Observation) -> Inputs:
-        """What the policy takes of an observation, by name: new arrays, the same for all robots."""
+        """The policy's inputs from an observation, by name: new arrays, the same for all robots."""
 
     def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
-        """What n robots' policy makes of their inputs. The only one that any thread may call."""
+        """Features of n robots from their inputs. The only one that any thread may call."""
 
     def step(
         self,
@@ -146,7 +146,7 @@ class SingleAgents:
         return self._policies[0].message_size
 
     def inputs(self, robot: int, observation: Observation) -> Inputs:
-        """What the agent says that it computed from, and the features that it computed."""
+        """The agent's record of its inputs, and the features that it computed."""
         try:
             perceived = self._agents[robot].observe(observation)
         except Exception as error:

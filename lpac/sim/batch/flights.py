@@ -26,7 +26,7 @@ from lpac.sim.vehicles import PointVehicles
 
 
 class PolicyInputs(NamedTuple):
-    """What a world's robots decide by: arrays (n, ...) by name, of the n robots of `robots`.
+    """Inputs of a world's robots: arrays (n, ...) by name, of the n robots of `robots`.
 
     It is what each perceived last, which was up to a perception period ago. Robots that failed, or
     have perceived nothing for longer than `max_input_age_s`, are left out.

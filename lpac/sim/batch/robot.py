@@ -200,7 +200,7 @@ class BatchedRobot:
         )
 
     def inputs(self, now_s: float) -> Inputs | None:
-        """What its policy takes of what it last perceived; None if that is too old."""
+        """The policy's inputs from its last perception; None if that is too old."""
         perceived = self._perceived
         if perceived is None or now_s - perceived.time_s > self._parameters.max_input_age_s:
             return None

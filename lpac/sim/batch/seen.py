@@ -1,4 +1,4 @@
-"""What a robot has seen of a known world: which of its cells, and nothing else."""
+"""Map of a robot in a known world: which of its cells it has seen, and nothing else."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ _MARGIN = 64
 
 
 class ShownWorld:
-    """What sensors show of a world, and what robots that share maps tell of it."""
+    """World that sensors show, and that robots that share maps tell of."""
 
     def __init__(self, importance: F32, parameters: PerceptionParameters) -> None:
         """`importance` (world_size, world_size) is the world, which is not copied."""
@@ -26,7 +26,7 @@ class ShownWorld:
 
 
 class SeenMap:
-    """What one robot remembers of the world that its sensor shows it, and of what others tell.
+    """Map of one robot, from its sensor's views of the world and what others tell.
 
     It is what `edge.core.memory.RobotMemory` is: where the robot has seen, the world's importance,
     elsewhere what stands for the unseen. The world is all robots' own; what a robot has of its own
@@ -63,7 +63,7 @@ class SeenMap:
             self._cells.hear(told)
 
     def tell(self, position: F64) -> SharedMap | None:
-        """What others may know of the surroundings of `position`; None if maps are not shared."""
+        """Shared map of the surroundings of `position`; None if maps are not shared."""
         return self._cells.tell(position) if self._cells else None
 
     def local_map(self, position: F64, out: F32) -> F32:

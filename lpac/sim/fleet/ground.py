@@ -54,7 +54,7 @@ class GroundProgram:
 
     @property
     def told(self) -> GroundSubscriber:
-        """What it tells, as long as it runs."""
+        """Subscriber to the ground, as long as it runs."""
         assert self._told is not None
         return self._told
 
@@ -103,7 +103,7 @@ class GroundProgram:
         self._listen()
 
     def _listen(self) -> None:
-        """Who listens gives a ground up that is silent, so begin anew."""
+        """Start anew, since listeners give a silent ground up."""
         told = self._connected()
         if self._told is not None:
             self._told.__exit__(None, None, None)

@@ -1,4 +1,4 @@
-"""What a simulated fleet is before it runs: its world and field, and where its robots stand."""
+"""Layout of a simulated fleet before it runs: its world and field, and where its robots stand."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ _PAD_SLACK = 1e-3
 
 
 def settings_of(scenario: Scenario) -> Settings:
-    """What robot.toml has of a scenario, by table."""
+    """Tables of robot.toml that a scenario sets."""
     clocks = scenario.clocks
     return {
         "rates": {

@@ -1,4 +1,4 @@
-"""What the robots of a fleet say of themselves on the radio, for whoever only listens."""
+"""Listener to the statuses of a fleet's robots on the radio."""
 
 import threading
 import time

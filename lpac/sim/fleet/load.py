@@ -44,7 +44,7 @@ def robots_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> float:
 
 
 def _units_per_s(bundle: Path) -> float:
-    """What all cores do together; the median of rounds, so that a moment's load does not count."""
+    """Speed of all cores together; the median of rounds, so that a moment's load does not count."""
     with ExitStack() as stack:
         workers = [
             stack.enter_context(

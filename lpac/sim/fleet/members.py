@@ -35,7 +35,7 @@ class SimulatedMembers:
         start: int,
         clock_s: Callable[[], float],
     ) -> SignedGuard:
-        """What the member speaks and hears through."""
+        """Guard that the member speaks and hears through."""
         return SignedGuard(self.join(role, name, robot_id, start), clock_s)
 
     def revoke(self, role: Role, name: str) -> bytes:

@@ -20,7 +20,7 @@ _BACK_S, _LETS_GO_S = 9.0, 1.0
 
 
 class PilotedVehicle(Protocol):
-    """What a pilot sees of a vehicle, and does with its remote control: `Px4Vehicle`, or a PX4.
+    """A pilot's view of a vehicle, and its remote control: `Px4Vehicle`, or a PX4.
 
     `position_m` (3,) is where it really is, `rc_connected` whether the remote control is heard.
     """
@@ -40,7 +40,7 @@ class PilotedVehicle(Protocol):
 
 
 def perturbations(failures: Sequence[Failure]) -> tuple[Perturbation, ...]:
-    """What the ground orders: pilots are given the robots, and they are taken back."""
+    """Orders of the ground: pilots are given the robots, and they are taken back."""
     return tuple(
         each
         for failure in failures

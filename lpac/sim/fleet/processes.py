@@ -66,7 +66,7 @@ class OverloadError(RuntimeError):
 
 
 class Usage(NamedTuple):
-    """What a process took so far: processor time, s, and its greatest resident memory, MB."""
+    """Resources of a process so far: processor time, s, and its greatest resident memory, MB."""
 
     cpu_s: float
     peak_memory_mb: float
@@ -192,7 +192,7 @@ class RouterProcess:
 
 
 def process_usage(pid: int) -> Usage:
-    """What a process of this machine took so far."""
+    """Measure a process of this machine so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     ticks = int(fields[11]) + int(fields[12])
     status = Path(f"/proc/{pid}/status").read_text()

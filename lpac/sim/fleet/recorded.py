@@ -1,4 +1,4 @@
-"""What policies decided in a simulated flight, decided again: the same flight on any CPU.
+"""Recorded decisions of policies in a simulated flight: the same flight on any CPU.
 
 onnxruntime's numbers differ in the last bits from one type of CPU to another, and a flight then
 goes another way. Their flight logs hold what the robots' policies made of it.
@@ -33,7 +33,7 @@ class RecordedAgent:
         return Perceived(np.zeros(0, np.float32), {})
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
-        """What was decided at this time. Raises PartError if nothing was."""
+        """Decision at this time. Raises PartError if there was none."""
         return self._steps.at(self._unix_s())
 
     def reset(self) -> None:

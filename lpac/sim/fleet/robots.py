@@ -94,7 +94,7 @@ class SimulatedRobot:
 
     @property
     def status(self) -> RobotStatus | None:
-        """What it said last, also before its program ended; None: nothing yet."""
+        """Its last status, also from before its program ended; None: none yet."""
         return (self.node and self.node.status) or self._said
 
     def start(self) -> None:
@@ -300,7 +300,7 @@ class SimulatedRobots:
         raise NotImplementedError
 
     def _new_guard(self, robot: SimulatedRobot, start: int) -> Guard:
-        """What that start of its program speaks and hears through."""
+        """Guard that that start of its program speaks and hears through."""
         return Unguarded()
 
     def _next_boot(self) -> int:

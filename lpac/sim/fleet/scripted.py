@@ -47,7 +47,7 @@ _TAKE_BACK_AGAIN_S = 3.0
 
 
 class CommandOutcome(NamedTuple):
-    """What was commanded, and what came of it."""
+    """A command, and its outcome."""
 
     request: Request
     report: CommandReport
@@ -148,7 +148,7 @@ class ScriptedFlight(ScriptListener):
         return report
 
     def _take_back(self) -> Procedure[None]:
-        """Whose vehicle left offboard by itself, as a busy machine makes it, flies on.
+        """Let a vehicle fly on that left offboard by itself, as on a busy machine.
 
         Whom the script gives to a pilot is left to that one.
         """

@@ -191,7 +191,7 @@ class SimulatedGround:
 
     @property
     def setup(self) -> FleetSetup:
-        """What seldom changes."""
+        """The fleet's setup, which seldom changes."""
         return self.node.station.setup
 
     @property

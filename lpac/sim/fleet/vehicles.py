@@ -43,7 +43,7 @@ class Vehicles(Protocol):
         """Raises VehicleError if one has ended."""
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """What they did so far, each.
+        """Tracks of the vehicles so far, one each.
 
         Times are `time.monotonic()`, positions north, east, down from the world's origin, m.
         """

@@ -1,4 +1,4 @@
-"""What PX4 finds wrong with the vehicle: its health and arming checks, as it reports them.
+"""PX4's health and arming checks of the vehicle, as it reports them.
 
 Each problem belongs to a component and keeps the vehicle from being armed in some modes. A report
 is all of them at one time, and from it follow the bits of SYS_STATUS, whether a mode may be armed,
@@ -45,7 +45,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Px4Event:
-    """What the vehicle tells: an EVENT, and beside it a text where PX4 has one.
+    """Report of the vehicle: an EVENT, and beside it a text where PX4 has one.
 
     `number` is the event's in PX4's own list.
     """
@@ -229,7 +229,7 @@ class HealthReporter:
         return self._tell(now_s)
 
     def before_failsafe(self, now_s: float) -> list[Px4Event]:
-        """What was not told yet, since a failsafe is about to act on it.
+        """Report at once what was not told yet, since a failsafe is about to act on it.
 
         PX4 tells it by events alone: SYS_STATUS stays behind until the next report.
         """

@@ -156,7 +156,7 @@ class Errors:
         return _sum_about(north, time_s), _sum_about(east, time_s), 0.0
 
     def gps_accuracy_m(self, time_s: float) -> tuple[float, float]:
-        """What the receiver says of its fix, horizontally and vertically."""
+        """The receiver's own accuracy of its fix, horizontally and vertically."""
         least_m, greatest_m = GPS_ACCURACIES_M
         accuracy_m = least_m + (greatest_m - least_m) * (1.0 - self._share_of_sky(time_s))
         return accuracy_m, GPS_VERTICAL * accuracy_m

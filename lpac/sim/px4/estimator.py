@@ -85,7 +85,7 @@ class Estimator:
 
     @property
     def accuracy_m(self) -> tuple[float, float]:
-        """What it takes its own errors for, horizontally and vertically."""
+        """Its own accuracy, as it takes it, horizontally and vertically."""
         if not self.is_aligned:
             return 14.1, 1.8
         if not self.has_used_gps:

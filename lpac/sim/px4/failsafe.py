@@ -14,7 +14,7 @@ from lpac.sim.px4.modes import (
 
 
 class Failsafe:
-    """What PX4 does of all that has gone wrong. `action` is what it does now."""
+    """PX4's reaction to all that has gone wrong. `action` is what it does now."""
 
     def __init__(self) -> None:
         self.action = FailsafeAction.NONE

@@ -102,7 +102,7 @@ def request_event(first_sequence: int, last_sequence: int) -> Any:
 
 
 class Px4Link:
-    """What one vehicle says and understands, and when.
+    """MAVLink of one vehicle: its messages, their times, and the commands that it understands.
 
     Over a wire: give it datagrams (`receive`), take from it those that are due (`due`). Within one
     process the same goes as message objects (`hear`, `say`), which costs a tenth: their numbers

@@ -50,7 +50,7 @@ class MavResult(IntEnum):
 
 
 class FailsafeAction(IntEnum):
-    """What a failsafe does, the gravest last."""
+    """Actions of a failsafe, the gravest last."""
 
     NONE = 0
     WARN = 1

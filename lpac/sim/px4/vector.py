@@ -33,5 +33,5 @@ def times(a: Sequence[float], factor: float) -> Vector:
 
 
 def level(a: Sequence[float]) -> Vector:
-    """What of it lies in the plane."""
+    """The part in the plane."""
     return a[0], a[1], 0.0

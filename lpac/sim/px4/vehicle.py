@@ -117,7 +117,7 @@ class Px4Setpoint:
 
 
 class SimulatedSensor(StrEnum):
-    """What a driver may die of."""
+    """Sensor that can fail, or whose driver can."""
 
     GPS = "gps"
     BAROMETER = "barometer"
@@ -151,7 +151,7 @@ _CAUSES = {FailsafeCause.MANUAL_CONTROL_LOST: 1, FailsafeCause.GROUND_STATION_LO
 
 
 class Truth(NamedTuple):
-    """What is really so at one time: world frame, m and m/s.
+    """True state at one time: world frame, m and m/s.
 
     `setpoint_at_s` is when the last setpoint came, -inf before the first, and `follows` what it
     asked for: a stop is a velocity of zero in the plane. `velocity_error_m_s` is how wrong its
@@ -319,7 +319,7 @@ class Px4Vehicle:
 
     @property
     def global_fix(self) -> tuple[float, float, float]:
-        """What the receiver takes its place to be: latitude and longitude, deg, and height, m.
+        """The receiver's position: latitude and longitude, deg, and height, m.
 
         It errs as the estimate does, which follows it, and has noise besides; it comes late.
         """
@@ -339,12 +339,12 @@ class Px4Vehicle:
         return plus(plus(honest_m, self.gps_jump_m.tolist()), noise_m)
 
     def _shared_error_m(self) -> Vector:
-        """What fix and estimate err by together."""
+        """Error that fix and estimate have in common."""
         return plus(plus(self.gps_bias_m.tolist(), self._walk_m), self.gps_offset_m.tolist())
 
     @property
     def gps_accuracy_m(self) -> tuple[float, float, float]:
-        """What the receiver says of its fix: horizontally and vertically, m, and m/s."""
+        """The receiver's own accuracy: horizontally and vertically, m, and m/s."""
         accuracy_m = GPS_ACCURACY_M
         if self._errors is not None:
             accuracy_m = self._errors.gps_accuracy_m(self.time_s)
@@ -385,12 +385,12 @@ class Px4Vehicle:
 
     @property
     def health(self) -> HealthReport | None:
-        """What PX4 found wrong when it reported last; None in the first seconds."""
+        """Problems in PX4's last report; None in the first seconds."""
         return self._reporter.published
 
     @property
     def current_a(self) -> float:
-        """What the battery gives."""
+        """Current that the battery gives."""
         loss = 0.0 if self._errors is None else self._errors.thrust_loss
         return IDLE_A + (HOVER_A * (1.0 + loss) if self.armed and not self.landed else 0.0)
 
@@ -402,7 +402,7 @@ class Px4Vehicle:
 
     @property
     def battery_told(self) -> float:
-        """What PX4 takes to be left, 0 to 1: by a voltage that sags more than it knows."""
+        """PX4's estimate of the charge, 0 to 1: by a voltage that sags more than it knows."""
         if self._errors is None:
             return self.battery_remaining
         unknown_v = self.current_a * (self._errors.resistance_ohm - ASSUMED_OHM)
@@ -432,7 +432,7 @@ class Px4Vehicle:
         return self._checks().can_arm(self.mode)
 
     def take_events(self) -> list[Px4Event]:
-        """What the vehicle has to say since the last call."""
+        """Events since the last call."""
         events, self._events = self._events, []
         return events
 
@@ -1075,7 +1075,7 @@ class Px4Vehicle:
 
 
 def _axis(velocity_m_s: float, error_m: float, gain: float, drift_m_s: float) -> float:
-    """What a setpoint asks for along one axis, where a NaN asks for nothing."""
+    """A setpoint along one axis, where a NaN asks for nothing."""
     feed_m_s = 0.0 if math.isnan(velocity_m_s) else velocity_m_s
     return feed_m_s + (drift_m_s if math.isnan(error_m) else gain * error_m)
 

@@ -217,7 +217,7 @@ class Px4Build:
                 )
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """What PX4's own log says, once PX4 has ended; what it sent, where there is no log."""
+        """Tracks by PX4's own log, once PX4 has ended; by its messages, where there is no log."""
         return tuple(self._track(instance) for instance in self._instances)
 
     def forget(self) -> None:
@@ -248,7 +248,7 @@ class Px4Build:
         return longest_s
 
     def logged_truth(self, number: int) -> list[Truth]:
-        """What a PX4's own log says, which is whole once PX4 has ended; [] if it says nothing.
+        """Read a PX4's own log, which is whole once PX4 has ended; [] if it says nothing.
 
         Times are `time.monotonic()`.
         """

@@ -264,7 +264,7 @@ class RealVehicle:
             self.set_parameter(name, number, mavlink.MAV_PARAM_TYPE_INT32)
 
     def _sticks(self) -> Any:
-        """What the receiver hears from somebody who looks along the vehicle's nose."""
+        """Sticks of a person who looks along the vehicle's nose."""
         north, east, down = self._sticks_m_s
         cos, sin = math.cos(self._heading_rad), math.sin(self._heading_rad)
         shares = (

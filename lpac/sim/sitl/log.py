@@ -1,4 +1,4 @@
-"""What a real PX4's vehicle did, from the log that PX4 writes (ULog)."""
+"""Flight of a real PX4's vehicle, from the log that PX4 writes (ULog)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _ARMED = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Px4Truth:
-    """What was so; times are PX4's own, s since it started, ascending.
+    """Truth in the log; times are PX4's own, s since it started, ascending.
 
     `position_m` and `velocity_m_s` (T, 3) are north, east, down in the world, heights from where
     the vehicle stood; `heading_rad` (T,) clockwise from north. `velocity_error_m_s` (T,) is how
