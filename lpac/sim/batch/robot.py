@@ -7,7 +7,7 @@ leaves a `DeferredStep` to be computed later, together with others' (`DeferredSt
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -41,17 +41,26 @@ _AGE_ERROR_S = _age_error_s()
 
 
 @dataclass(slots=True, eq=False)
+class DeferredFeatures:
+    """An agent's inputs from one perception, and its features, once they are computed."""
+
+    agent: int
+    inputs: Inputs
+    values: F32 = field(init=False)
+
+
+@dataclass(slots=True, eq=False)
 class DeferredStep:
     """A tick of a robot's policy: what it takes, and what it computes, once it is computed.
 
-    `heeded` are the ticks from which its neighbours' messages are. `rank` is how many others have
-    to be computed first, one after another. `velocity` (2,) is None as long as it is not computed,
-    and `payload` (message_size,), the numbers that the neighbours receive, undefined; `largest` is
-    the largest of these.
+    Ticks between two perceptions take the same `features`. `heeded` are the ticks from which its
+    neighbours' messages are. `rank` is how many others have to be computed first, one after
+    another. `velocity` (2,) is None as long as it is not computed, and `payload` (message_size,),
+    the numbers that the neighbours receive, undefined; `largest` is the largest of these.
     """
 
     robot: "BatchedRobot"
-    inputs: Inputs
+    features: DeferredFeatures
     heeded: "tuple[DeferredStep, ...]"
     degree: int
     rank: int
@@ -68,6 +77,11 @@ class DeferredSteps:
         self.agents = agents
         self._payload_limit = np.inf if payload_limit is None else payload_limit
         self._steps: list[DeferredStep] = []
+        self._features: list[DeferredFeatures] = []
+
+    def add_features(self, features: DeferredFeatures) -> None:
+        """Compute them later, before the first step that takes them."""
+        self._features.append(features)
 
     def add(self, step: DeferredStep) -> None:
         """Compute it later."""
@@ -76,24 +90,24 @@ class DeferredSteps:
     def compute(self) -> None:
         """Compute them all. Raises PolicyFailedError."""
         steps, self._steps = self._steps, []
-        if not steps:
-            return
-        features = self.agents.features(
-            [step.robot.agent for step in steps], [step.inputs for step in steps]
-        )
+        features, self._features = self._features, []
+        if features:
+            agents, inputs = [each.agent for each in features], [each.inputs for each in features]
+            for each, values in zip(features, self.agents.features(agents, inputs), strict=True):
+                each.values, each.inputs = values, {}
         ranked = defaultdict(list)
-        for i, step in enumerate(steps):
-            ranked[step.rank].append(i)
+        for step in steps:
+            ranked[step.rank].append(step)
         for _, group in sorted(ranked.items()):
-            self._step([steps[i] for i in group], [features[i] for i in group])
+            self._step(group)
         for step in steps:
             # What it was computed from would hold on to all that was before.
-            step.inputs, step.heeded = {}, ()
+            step.heeded = ()
 
-    def _step(self, steps: list[DeferredStep], features: list[F32]) -> None:
+    def _step(self, steps: list[DeferredStep]) -> None:
         velocities, payloads = self.agents.step(
             [step.robot.agent for step in steps],
-            features,
+            [step.features.values for step in steps],
             [[other.payload for other in step.heeded] for step in steps],
             [step.degree for step in steps],
         )
@@ -123,7 +137,7 @@ class _Said(NamedTuple):
     message: _Message
 
 
-class _Perceived(NamedTuple):
+class _Look(NamedTuple):
     """When the robot looked, from where (2,), where those in range were (n, 2), what it tells.
 
     `velocity` (2,) is its own, in model units/s.
@@ -165,7 +179,9 @@ class BatchedRobot:
         self._seen = SeenMap(world)
         self._local_map = local_map
         self._swap_clears = parameters.max_message_age_s == 0.0
-        self._perceived: _Perceived | None = None
+        self._look: _Look | None = None
+        # Of that, once its policy has taken them.
+        self._features: DeferredFeatures | None = None
         self._action: DeferredStep | None = None
         self._action_s = 0.0
         # The last action that was flown, and its velocity in the mission frame.
@@ -195,34 +211,25 @@ class BatchedRobot:
                 self._seen.hear(neighbour.shared)
         velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)
         velocity = self._parameters.scale.velocity_to_model(velocity_m_s)
-        self._perceived = _Perceived(
-            now_s, own, self._to_model(heard)[near], velocity, self._seen.tell(own)
-        )
+        self._look = _Look(now_s, own, self._to_model(heard)[near], velocity, self._seen.tell(own))
+        self._features = None
 
     def inputs(self, now_s: float) -> Inputs | None:
         """The policy's inputs from its last perception; None if that is too old."""
-        perceived = self._perceived
-        if perceived is None or now_s - perceived.time_s > self._parameters.max_input_age_s:
-            return None
-        position = clamp_to_world(perceived.own, self._perception.world_size)
-        return self._deferred.agents.inputs(
-            self.agent,
-            Observation(
-                position,
-                self._seen.local_map(position, self._local_map),
-                perceived.neighbours,
-                perceived.velocity,
-            ),
-        )
+        look = self._fresh_look(now_s)
+        return None if look is None else self._inputs(look)
 
     def infer(self, now_s: float) -> _Said | None:
         """Leave a step of the policy to be computed, and say the message that it leads to.
 
         None when there is nothing to send: nothing perceived that is fresh.
         """
-        inputs = self.inputs(now_s)
-        if inputs is None or self._perceived is None:
+        look = self._fresh_look(now_s)
+        if look is None:
             return None
+        if self._features is None:
+            self._features = DeferredFeatures(self.agent, self._inputs(look))
+            self._deferred.add_features(self._features)
         odometry, own = self._own()
         # Where the swap takes nothing away, the neighbours are those whose messages it hands out.
         heard = self.mailbox.neighbours(now_s) if self._swap_clears else ()
@@ -239,7 +246,7 @@ class BatchedRobot:
         before = (*heeded, self._action) if self._action else heeded
         step = DeferredStep(
             self,
-            inputs,
+            self._features,
             heeded,
             degree,
             max((other.rank + 1 for other in before if other.velocity is None), default=0),
@@ -257,7 +264,7 @@ class BatchedRobot:
             velocity_m_s=odometry.velocity_m_s,
             frame_id=0,
             payload=step.payload,
-            shared=self._perceived.shared,
+            shared=look.shared,
             step=step,
         )
         return _Said(message)
@@ -283,6 +290,17 @@ class BatchedRobot:
     def note_payloads(self, heeded: tuple[DeferredStep, ...]) -> None:
         """Those whose payloads its policy took."""
         self.largest_payload = max((self.largest_payload, *(each.largest for each in heeded)))
+
+    def _fresh_look(self, now_s: float) -> _Look | None:
+        look = self._look
+        is_old = look is None or now_s - look.time_s > self._parameters.max_input_age_s
+        return None if is_old else look
+
+    def _inputs(self, look: _Look) -> Inputs:
+        position = clamp_to_world(look.own, self._perception.world_size)
+        local_map = self._seen.local_map(position, self._local_map)
+        observation = Observation(position, local_map, look.neighbours, look.velocity)
+        return self._deferred.agents.inputs(self.agent, observation)
 
     def _own(self) -> tuple[Odometry, F64]:
         odometry = self._odometry.odometry()

@@ -5,12 +5,14 @@ a batch as it computes it alone. So flights are equal to the last bit.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge.core import F32
 from edge.core.coverage import coverage_cost
 from edge.core.frames import ModelScale
 from edge.core.memory import RobotMemory
@@ -24,7 +26,7 @@ from edge.policy.lpac.policy import LpacAgent
 from lpac.radio.airtime import TRANSPORTS, Wifi
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.batch import BatchedFlights, PolicyFailedError, fly_batch
-from lpac.sim.batch.agents import SingleAgents
+from lpac.sim.batch.agents import Inputs, LpacAgents, SingleAgents
 from lpac.sim.batch.seen import SeenMap, ShownWorld
 from lpac.sim.description import FIELD_SCALE
 from lpac.sim.experiment import SimulatedFlight, fly
@@ -169,6 +171,24 @@ def test_agents_one_by_one_fly_the_same(
     monkeypatch.setattr("lpac.sim.batch.flights.make_agents", SingleAgents)
     for bundle, flights in zip(bundles, expected, strict=True):
         assert_same(*fly_batch([HARD], bundle), *flights)
+
+
+def test_a_perception_is_computed_once_for_all_steps_that_follow_it(
+    shipped_bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    computed: list[int] = []
+    compute = LpacAgents.features
+
+    def counted(agents: LpacAgents, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
+        computed.extend(robots)
+        return compute(agents, robots, inputs)
+
+    monkeypatch.setattr(LpacAgents, "features", counted)
+    clocks = Clocks(perception_s=0.5, policy_s=0.1)
+    scenario = Scenario(robots=3, duration_s=4.0, clocks=clocks)
+    [flight] = fly_batch([scenario], shipped_bundle)
+    assert flight.messages["broadcasts"] > 3 * 35 and len(computed) <= 3 * 9
+    assert_same(flight, fly(scenario, shipped_bundle))
 
 
 @settings(max_examples=60, deadline=None)
