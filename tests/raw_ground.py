@@ -2,7 +2,6 @@
 
 import secrets
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Self
 
 from edge.drivers.zenoh_link import ZenohLink
@@ -31,12 +30,7 @@ class RawGround:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._link.close()
 
     def order(self, kind: OrderKind, to: RobotStatus, operator: str = "") -> OrderResult:

@@ -3,7 +3,6 @@
 import errno
 import socket
 import struct
-from types import TracebackType
 from typing import Self
 
 
@@ -33,12 +32,7 @@ class ProcessLock:
         self._socket.listen()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._socket.close()
 
 

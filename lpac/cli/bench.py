@@ -3,13 +3,14 @@
 import json
 import os
 import platform
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from msgspec import Meta
 
 from lpac.cli.apps import new_app
 from lpac.cli.fields import options_of
@@ -66,11 +67,13 @@ class NetworkOptions:
         ),
     ] = None  # fmt: skip
     repetitions: Annotated[
-        int | None, "If not given, 10 of restarts, 3 of each point of a curve."
+        Annotated[int, Meta(ge=1)] | None,
+        "If not given, 10 of restarts, 3 of each point of a curve.",
     ] = None
-    seconds: Annotated[float | None, "Length of a run: 60 with restarts, else 10, by default."] = (
-        None
-    )
+    seconds: Annotated[
+        Annotated[float, Meta(ge=1.0)] | None,
+        "Length of a run: 60 with restarts, else 10, by default.",
+    ] = None
     namespaces: Annotated[
         str | None,
         typer.Option(
@@ -140,22 +143,17 @@ def _checked(given: Sequence[str] | None) -> tuple[str, ...]:
 def _plan(experiment: "Experiment", middlewares: tuple[str, ...], of: NetworkOptions) -> "Plan":
     from lpac.middleware.measure import Plan
 
-    robots, repetitions, seconds = of.robots, of.repetitions, of.seconds
     its_robots, its_repetitions, its_seconds = _RESTARTS if experiment == "restarts" else _ROBOTS
-    fleet = its_robots if robots is None else robots
+    fleet = its_robots if of.robots is None else of.robots
     least = 2 if experiment == "restarts" else 1
     if fleet < least:
         raise ValueError(f"--robots {fleet}: {experiment} needs at least {least}")
-    if repetitions is not None and repetitions < 1:
-        raise ValueError(f"--repetitions {repetitions}: must be at least 1")
-    if seconds is not None and not seconds >= 1.0:
-        raise ValueError(f"--seconds {seconds:g}: must be at least 1")
     return Plan(
         experiment=experiment,
         middlewares=middlewares,
         robots=(fleet,) if experiment == "restarts" else tuple(range(1, fleet + 1)),
-        repetitions=repetitions or its_repetitions,
-        seconds=seconds or its_seconds,
+        repetitions=of.repetitions or its_repetitions,
+        seconds=of.seconds or its_seconds,
     )
 
 
@@ -245,14 +243,14 @@ def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
             f"throughput between two of {restarts[0].robots} robots whose programs all restart, "
             f"{its[0].seconds:.0f} s; mean and standard deviation\n"
         )
-        print_table(_RESTART_COLUMNS, [_restart_row(one) for one in restarts], _RESTART_COLUMNS[1:])
+        _print_summaries(_RESTART_COLUMNS, restarts)
     curves = [summary for summary in of_each if summary.experiment == "robots"]
     if curves:
         typer.echo(
             f"{chr(10) if restarts else ''}throughput between two places while so many robots' "
             "programs run, and how old their messages are when they arrive\n"
         )
-        print_table(_CURVE_COLUMNS, [_curve_row(one) for one in curves], _CURVE_COLUMNS[1:])
+        _print_summaries(_CURVE_COLUMNS, curves)
     if where["where"] == "loopback":
         typer.echo(
             "\nmeasured on this machine's loopback, which has no radio: the stream is as fast as "
@@ -270,41 +268,30 @@ _LEGEND = (
     "heard after: how long after a restart robots first heard each other, half of all pairs and "
     "the last; never: pairs that did not until the next; busy: this machine's processors"
 )
-_RESTART_COLUMNS = (
-    "", "Mbit/s", "delivered, %", "heard after, s", "the last, s", "never, %", "busy, %", "runs",
+_DELIVERED = ("delivered, %", lambda of: _number(of.measures.get("delivered"), 100.0))
+_THROUGHPUT = ("Mbit/s", lambda of: _number(of.measures["throughput_mbit_s"]))
+_BUSY = ("busy, %", lambda of: f"{100.0 * of.measures['processor'].mean:.0f}")
+_Columns = tuple[tuple[str, Callable[["Summary"], str]], ...]
+_RESTART_COLUMNS: _Columns = (
+    _THROUGHPUT, _DELIVERED,
+    ("heard after, s", lambda of: _number(of.measures.get("heard_again_p50_s"), digits=2)),
+    ("the last, s", lambda of: _number(of.measures.get("heard_again_max_s"), digits=2)),
+    ("never, %", lambda of: _number(of.measures.get("never_heard"), 100.0)),
+    _BUSY, ("runs", lambda of: str(of.measures["throughput_mbit_s"].runs)),
 )  # fmt: skip
-_CURVE_COLUMNS = ("", "robots", "Mbit/s", "age p50, ms", "p99, ms", "delivered, %", "busy, %")
+_CURVE_COLUMNS: _Columns = (
+    ("robots", lambda of: str(of.robots)), _THROUGHPUT,
+    ("age p50, ms", lambda of: _number(of.measures.get("age_p50_ms"))),
+    ("p99, ms", lambda of: _number(of.measures.get("age_p99_ms"))), _DELIVERED, _BUSY,
+)  # fmt: skip
 
 
-def _restart_row(of: "Summary") -> list[str]:
+def _print_summaries(columns: _Columns, summaries: "Sequence[Summary]") -> None:
     from lpac.middleware.figures import title_of
 
-    told = of.measures
-    return [
-        title_of(of.middleware),
-        _number(told.get("throughput_mbit_s")),
-        _number(told.get("delivered"), 100.0),
-        _number(told.get("heard_again_p50_s"), digits=2),
-        _number(told.get("heard_again_max_s"), digits=2),
-        _number(told.get("never_heard"), 100.0),
-        f"{100.0 * told['processor'].mean:.0f}",
-        str(told["throughput_mbit_s"].runs),
-    ]
-
-
-def _curve_row(of: "Summary") -> list[str]:
-    from lpac.middleware.figures import title_of
-
-    told = of.measures
-    return [
-        title_of(of.middleware),
-        str(of.robots),
-        _number(told.get("throughput_mbit_s")),
-        _number(told.get("age_p50_ms")),
-        _number(told.get("age_p99_ms")),
-        _number(told.get("delivered"), 100.0),
-        f"{100.0 * told['processor'].mean:.0f}",
-    ]
+    names = [name for name, _ in columns]
+    rows = [[title_of(of.middleware), *(cell(of) for _, cell in columns)] for of in summaries]
+    print_table(("", *names), rows, names)
 
 
 def _number(spread: "Spread | None", factor: float = 1.0, digits: int = 1) -> str:

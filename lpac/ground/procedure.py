@@ -57,6 +57,20 @@ class NothingComesError(RuntimeError):
     """The ground tells nothing any more."""
 
 
+def carry_out(
+    procedure: Procedure[T], command: Callable[[Request], object], wait: Callable[[Until], bool]
+) -> T:
+    """Answer a procedure until it is through, and return its result. Raises what it raises."""
+    answer: object = None
+    while True:
+        try:
+            wanted = procedure.send(answer)
+        except StopIteration as done:
+            result: T = done.value
+            return result
+        answer = wait(wanted) if isinstance(wanted, Until) else command(wanted)
+
+
 def fresh_snapshot(ground: Ground) -> Procedure[FleetSnapshot]:
     """The fleet as it is told from now on. Raises NothingComesError."""
     asked_unix_s = ground.unix_now_s

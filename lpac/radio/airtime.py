@@ -18,6 +18,7 @@ follows Bianchi, "Performance Analysis of the IEEE 802.11 Distributed Coordinati
 JSAC 18(3), 2000), with as many contenders as wait in a queue of such a load.
 """
 
+import bisect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -180,14 +181,11 @@ def carries(
     """
     _require_possible(transport, traffic)
     require(Positive, most, "most")
-    few, many = 0, most_robots + 1
-    while many - few > 1:
-        robots = (few + many) // 2
-        if _airtime(transport, wifi, traffic, robots).total <= most:
-            few = robots
-        else:
-            many = robots
-    return few
+
+    def total(robots: int) -> float:
+        return _airtime(transport, wifi, traffic, robots).total
+
+    return bisect.bisect_right(range(1, most_robots + 1), most, key=total)
 
 
 def guests_around(robots: int, *, of: int, per_m2: float, range_m: float) -> int:

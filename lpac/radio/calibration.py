@@ -30,6 +30,8 @@ from statistics import fmean, harmonic_mean
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import scipy  # its parts are loaded on first use
+
 from edge.core.schema import ConfigError, from_mapping
 from lpac.radio.airtime import Traffic, Transport, Wifi, airtime, link_quality
 from lpac.radio.records import RadioRecord, read_records
@@ -209,13 +211,7 @@ def _means(
 
 
 def _where_zero(falling: Callable[[float], float], low: float, high: float) -> float | None:
-    """None if it is not above 0 at `low` and below at `high`, on a scale that suits rates too."""
+    """None if it is not above 0 at `low` and below at `high`."""
     if not falling(low) > 0.0 > falling(high):
         return None
-    for _ in range(32):
-        middle = math.sqrt(low * high) if low > 0.0 else (low + high) / 2.0
-        if falling(middle) > 0.0:
-            low = middle
-        else:
-            high = middle
-    return (low + high) / 2.0
+    return float(scipy.optimize.brentq(falling, low, high, xtol=1e-9))

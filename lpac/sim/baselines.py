@@ -14,6 +14,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import scipy  # its parts are loaded on first use
 
 from edge.core import F32, F64, Bools
 from edge.core.coverage import cvt_velocity, local_centroid, voronoi_cells
@@ -167,17 +168,22 @@ class SharedCvt:
         self._maps = SharedMaps(importance, perception, robots)
 
     def goals(self, positions: F64) -> F64:
-        """The centroid of each robot's Voronoi cell in its local map."""
+        """The goal of each robot, by its local map and the others that it can reach."""
         self._maps.sense(positions)
         goals = np.empty_like(positions)
         for robot, position in enumerate(positions):
-            local, _, origin = self._maps.around(robot, position)
-            others = positions[self._maps.others(robot)]
-            goals[robot] = local_centroid(local, origin, position, others)
+            around, others = self._maps.around(robot, position), self._maps.others(robot)
+            goals[robot] = self._goal(position, *around, positions[others])
         return goals
 
+    def _goal(
+        self, position: F64, local: F32, seen: Bools, origin: tuple[int, int], others: F64
+    ) -> F64:
+        """The centroid of the robot's Voronoi cell in its local map."""
+        return local_centroid(local, origin, position, others)
 
-class FrontierCvt:
+
+class FrontierCvt(SharedCvt):
     """First explores, then covers: robots share maps and positions as `SharedCvt`'s do.
 
     Each goes to what is unseen and nearest in its own Voronoi cell of its local map, and when there
@@ -187,41 +193,26 @@ class FrontierCvt:
     learning" (IEEE Trans. Vehicular Technology, 2020).
     """
 
-    def __init__(self, importance: F32, perception: PerceptionParameters, robots: int) -> None:
-        self._maps = SharedMaps(importance, perception, robots)
-
-    def goals(self, positions: F64) -> F64:
-        """The nearest unseen point of each robot's cell, or the cell's centroid."""
-        self._maps.sense(positions)
-        goals = np.empty_like(positions)
-        for robot, position in enumerate(positions):
-            local, seen, origin = self._maps.around(robot, position)
-            others = positions[self._maps.others(robot)]
-            unseen = _unseen_points(seen, origin)
-            distance = np.linalg.norm(unseen - position, axis=1)
-            to_others = np.linalg.norm(unseen[:, None] - others, axis=2).min(axis=1, initial=np.inf)
-            own = distance <= to_others
-            if own.any():
-                goals[robot] = unseen[own][distance[own].argmin()]
-            else:
-                goals[robot] = local_centroid(local, origin, position, others)
-        return goals
+    def _goal(
+        self, position: F64, local: F32, seen: Bools, origin: tuple[int, int], others: F64
+    ) -> F64:
+        """The nearest unseen point of the robot's cell, or the cell's centroid."""
+        unseen = _unseen_points(seen, origin)
+        distance = np.linalg.norm(unseen - position, axis=1)
+        to_others = np.linalg.norm(unseen[:, None] - others, axis=2).min(axis=1, initial=np.inf)
+        own = distance <= to_others
+        if not own.any():
+            return super()._goal(position, local, seen, origin, others)
+        goal: F64 = unseen[own][distance[own].argmin()]
+        return goal
 
 
 def connected(positions: F64, communication_range: float) -> list[npt.NDArray[np.intp]]:
     """The robots (N, 2) that reach each other, directly or through others, each group ascending."""
-    left = np.arange(len(positions))
-    groups = []
-    while len(left):
-        group, new = left[:0], left[:1]
-        left = left[1:]
-        while len(new):
-            group = np.append(group, new)
-            offsets = positions[left][:, None] - positions[new]
-            near = (np.hypot(offsets[..., 0], offsets[..., 1]) < communication_range).any(axis=1)
-            new, left = left[near], left[~near]
-        groups.append(np.sort(group))
-    return groups
+    offsets = positions[:, None] - positions
+    near = np.hypot(offsets[..., 0], offsets[..., 1]) < communication_range
+    count, group_of = scipy.sparse.csgraph.connected_components(near, directed=False)
+    return [np.flatnonzero(group_of == group) for group in range(count)]
 
 
 def _unseen_points(seen: Bools, origin: tuple[int, int]) -> F64:

@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from threading import Condition, Lock, Thread
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from mavsdk.component_type import ComponentType
@@ -134,12 +133,7 @@ class MavsdkAutopilot:
         self._worker.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _open(self, mavsdk: Mavsdk) -> Datagrams:

@@ -16,7 +16,6 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 
 from edge.drivers.px4.left_alone import land_if_left, say
 from edge.drivers.px4.raw_mavlink import hold_command
@@ -75,12 +74,7 @@ class WatchdogProcess:
         os.close(reader)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         os.close(self._pipe)
         if self._process is not None:
             self._process.kill()

@@ -13,16 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 import typer
 
 from lpac.cli.fields import options_of
-from lpac.cli.fleet.progress import (
-    print_json,
-    print_problems,
-    require_all,
-    run_all,
-    run_for_each,
-)
+from lpac.cli.fleet.progress import print_json, require_all, run_all, run_for_each, tell
 from lpac.cli.fleet.status import SHORT, flight, program
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots, open_fleet
-from lpac.cli.printing import BAD, GOOD, print_notes, print_table, styled, working
+from lpac.cli.printing import GOOD, styled, working
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -74,12 +68,11 @@ def deploy(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson 
             return _Deployed(deployed, time.monotonic() - began_s)
 
         outcomes = run_for_each(chosen, one)
-    if as_json:
-        print_json(config, outcomes, lambda v: {**v.deployed._asdict(), "duration_s": v.duration_s})
-    else:
-        numbers = ("MB sent", "perceive ms", "infer ms", "s")
-        print_outcomes(outcomes, ("release", *numbers, "result"), _deployed_cells, numbers)
-    require_all(outcomes, "deployed on")
+    tell(
+        config, outcomes, "deployed on", as_json=as_json, cells=_deployed_cells,
+        numbers=("MB sent", "perceive ms", "infer ms", "s"), headings=("release",),
+        describe=lambda v: {**v.deployed._asdict(), "duration_s": v.duration_s},
+    )  # fmt: skip
 
 
 def _deployed_cells(value: _Deployed) -> tuple["str | Text", ...]:
@@ -104,14 +97,11 @@ def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJso
     async def one(robot: "RobotHost", report: "Report") -> str:
         return await roll_back(config, robot, report)
 
-    outcomes = run_for_each(chosen, one)
-    if as_json:
-        print_json(config, outcomes, lambda release: {"release": release})
-    else:
-        print_outcomes(
-            outcomes, ("release", "result"), lambda release: (release, styled("rolled back", GOOD))
-        )
-    require_all(outcomes, "rolled back on")
+    tell(
+        config, run_for_each(chosen, one), "rolled back on", as_json=as_json,
+        headings=("release",), cells=lambda release: (release, styled("rolled back", GOOD)),
+        describe=lambda release: {"release": release},
+    )  # fmt: skip
 
 
 # The program
@@ -168,16 +158,10 @@ def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = 
                 "land", mavlink_port=robot.mavlink_port, system_id=robot.system_id
             )
 
-    outcomes = run_for_each(chosen, one)
-    if as_json:
-        print_json(config, outcomes, dict)
-    else:
-        print_outcomes(
-            outcomes,
-            ("result",),
-            lambda v: (styled("it lands" if v["armed"] else "it has landed", GOOD),),
-        )
-    require_all(outcomes, "landing:")
+    tell(
+        config, run_for_each(chosen, one), "landing:", as_json=as_json, describe=dict,
+        cells=lambda v: (styled("it lands" if v["armed"] else "it has landed", GOOD),),
+    )  # fmt: skip
 
 
 def _control(
@@ -201,19 +185,11 @@ def _control(
             service = await held.session.call(function, **arguments, **port)
             return _Controlled(held.found["current"], service, held.recovered)
 
-    outcomes = run_for_each(robots, one)
-    if as_json:
-        print_json(config, outcomes, _Controlled._asdict)
-    else:
-        print_outcomes(
-            outcomes,
-            ("release", "flight", "result"),
-            lambda v: ((v.release or "")[:SHORT], flight(v.service), program(v.service)),
-        )
-        print_notes([
-            (o.robot.name, o.value.recovered) for o in outcomes if o.value and o.value.recovered
-        ])  # fmt: skip
-    require_all(outcomes, done)
+    tell(
+        config, run_for_each(robots, one), done, as_json=as_json, describe=_Controlled._asdict,
+        headings=("release", "flight"), note=lambda v: v.recovered,
+        cells=lambda v: ((v.release or "")[:SHORT], flight(v.service), program(v.service)),
+    )  # fmt: skip
 
 
 def _without_spares(
@@ -346,22 +322,6 @@ def _labels(robots: Sequence["RobotHost"]) -> dict[str, str]:
         robot.name: typer.style(robot.name.ljust(width), fg=_COLOURS[n % len(_COLOURS)]) + "  "
         for n, robot in enumerate(robots)
     }
-
-
-def print_outcomes(
-    outcomes: Sequence["Outcome[T]"],
-    headings: Sequence[str],
-    cells: Callable[[T], Sequence["str | Text"]],
-    right: Sequence[str] = (),
-) -> None:
-    """A row for each robot, whose last cell says what came of it; below, why not."""
-    blank = [""] * (len(headings) - 1)
-    rows = [
-        [o.robot.name, *([*blank, styled("failed", BAD)] if o.value is None else cells(o.value))]
-        for o in outcomes
-    ]
-    print_table(("robot", *headings), rows, right)
-    print_problems(outcomes)
 
 
 def _decimal(value: float | None) -> str:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.fleet.everyday import print_outcomes
-from lpac.cli.fleet.progress import require_all, run_for_each
+from lpac.cli.fleet.progress import print_outcomes, require_all, run_for_each
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
 from lpac.cli.printing import BAD, GOOD, print_table, styled
 
@@ -188,7 +187,7 @@ def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
         await renew_card(config, robot, report)
 
     outcomes = run_for_each(chosen, one)
-    print_outcomes(outcomes, ("result",), lambda _: (styled("new key", GOOD),))
+    print_outcomes(outcomes, lambda _: (styled("new key", GOOD),))
     own = authority.own_name()
     if own is not None and robots is None:
         new_member(authority, authority.folder, Role.OPERATOR, own)

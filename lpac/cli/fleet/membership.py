@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lpac.cli.fields import flag_of, options_of
-from lpac.cli.fleet.everyday import print_outcomes
-from lpac.cli.fleet.progress import print_json, require_all, run_for_each
+from lpac.cli.fleet.progress import run_for_each, tell
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
 from lpac.cli.printing import GOOD, styled
 
@@ -184,13 +183,10 @@ def pull(
     async def one(robot: "RobotHost", report: "Report") -> "Pulled":
         return await pull_from(config, robot, trial, out, report)
 
-    outcomes = run_for_each(chosen, one)
-    if as_json:
-        print_json(config, outcomes, lambda pulled: pulled._asdict())
-    else:
-        numbers = ("files", "MB", "MB sent")
-        print_outcomes(outcomes, (*numbers, "result"), _pulled_cells, numbers)
-    require_all(outcomes, "pulled from")
+    tell(
+        config, run_for_each(chosen, one), "pulled from", as_json=as_json, cells=_pulled_cells,
+        numbers=("files", "MB", "MB sent"), describe=lambda pulled: pulled._asdict(),
+    )  # fmt: skip
 
 
 def _pulled_cells(value: "Pulled") -> tuple["str | Text", ...]:

@@ -6,15 +6,26 @@ import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import typer
 
-from lpac.cli.printing import BAD, FAINT, GOOD, lines_of, new_table, plain, print_notes, styled
+from lpac.cli.printing import (
+    BAD,
+    FAINT,
+    GOOD,
+    lines_of,
+    new_table,
+    plain,
+    print_notes,
+    print_table,
+    styled,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
@@ -95,6 +106,44 @@ def print_json(
         for outcome in outcomes
     }
     typer.echo(json.dumps({"fleet": config.fleet, "robots": robots}, indent=2))
+
+
+def tell(
+    config: "FleetConfig",
+    outcomes: Sequence["Outcome[T]"],
+    done: str,
+    *,
+    as_json: bool,
+    describe: Callable[[T], Mapping[str, object]],
+    cells: Callable[[T], Sequence["str | Text"]],
+    headings: Sequence[str] = (),
+    numbers: Sequence[str] = (),
+    note: Callable[[T], str | None] = lambda _: None,
+) -> None:
+    """Print JSON, or `print_outcomes` and notes; then `require_all`."""
+    if as_json:
+        print_json(config, outcomes, describe)
+    else:
+        print_outcomes(outcomes, cells, headings, numbers)
+        notes = [(o.robot.name, note(o.value)) for o in outcomes if o.value is not None]
+        print_notes([(name, text) for name, text in notes if text])
+    require_all(outcomes, done)
+
+
+def print_outcomes(
+    outcomes: Sequence["Outcome[T]"],
+    cells: Callable[[T], Sequence["str | Text"]],
+    headings: Sequence[str] = (),
+    numbers: Sequence[str] = (),
+) -> None:
+    """A row for each robot: cells of `headings`, of `numbers`, and the result; below, why not."""
+    failed = [*[""] * len((*headings, *numbers)), styled("failed", BAD)]
+    rows = [
+        [o.robot.name, *(failed if o.problem is not None else cells(cast(T, o.value)))]
+        for o in outcomes
+    ]
+    print_table(("robot", *headings, *numbers, "result"), rows, numbers)
+    print_problems(outcomes)
 
 
 def require_all(outcomes: Sequence["Outcome[T]"], done: str) -> None:

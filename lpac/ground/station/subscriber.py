@@ -3,13 +3,12 @@
 import threading
 import time
 from collections.abc import Callable, Collection
-from types import TracebackType
+from functools import partial
 from typing import Self, TypeVar
 
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
-from lpac.ground.procedure import NothingComesError, Procedure, Until
+from lpac.ground.procedure import NothingComesError, Procedure, Until, carry_out
 from lpac.ground.station.client import command, no_answer, subscribe
-from lpac.ground.station.protocol import CommandReport
 
 _PATIENCE_S = 5.0
 
@@ -39,12 +38,7 @@ class GroundSubscriber:
             raise no_answer(self.fleet)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._leaving = True
         # It notices with the next picture; if there comes none, it is left behind.
         self._thread.join(1.0)
@@ -88,26 +82,19 @@ class GroundSubscriber:
 
         `meanwhile` is called once a second or more often; what it raises ends the procedure.
         """
-        answer: CommandReport | bool | None = None
-        while True:
-            try:
-                wanted = procedure.send(answer)
-            except StopIteration as done:
-                result: T = done.value
-                return result
-            except NothingComesError:
-                raise no_answer(self.fleet) from None
-            if isinstance(wanted, Until):
-                answer = self._wait_until(wanted, meanwhile)
-            else:
-                answer = command(self.fleet, wanted, meanwhile=meanwhile)
 
-    def _wait_until(self, wanted: Until, meanwhile: Callable[[], None]) -> bool:
-        def holds(snapshot: FleetSnapshot) -> bool:
-            meanwhile()
-            return wanted.condition(snapshot)
+        def wait(wanted: Until) -> bool:
+            def holds(snapshot: FleetSnapshot) -> bool:
+                meanwhile()
+                return wanted.condition(snapshot)
 
-        return self.wait_for(holds, wanted.at_most_s)
+            return self.wait_for(holds, wanted.at_most_s)
+
+        ask = partial(command, self.fleet, meanwhile=meanwhile)
+        try:
+            return carry_out(procedure, ask, wait)
+        except NothingComesError:
+            raise no_answer(self.fleet) from None
 
     def _run(self) -> None:
         try:

@@ -20,7 +20,7 @@ from edge.identity.card import Role
 from edge.identity.guard import Guard, Unguarded
 from edge.messages.mission import GroundState
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent
-from lpac.ground.procedure import NothingComesError, Procedure, Until
+from lpac.ground.procedure import NothingComesError, Procedure, Until, carry_out
 from lpac.ground.station.config import load_ground
 from lpac.ground.station.node import GroundNode
 from lpac.ground.station.protocol import (
@@ -211,14 +211,7 @@ class SimulatedGround:
 
     def carry_out(self, procedure: Procedure[T]) -> T:
         """Let time pass until the procedure is through; what it comes to. Raises what it raises."""
-        answer: CommandReport | bool | None = None
-        while True:
-            try:
-                wanted = procedure.send(answer)
-            except StopIteration as done:
-                result: T = done.value
-                return result
-            answer = self._wait(wanted) if isinstance(wanted, Until) else self.command(wanted)
+        return carry_out(procedure, self.command, self._wait)
 
     def command(self, request: Request) -> CommandReport:
         """Have a command done. Raises NothingComesError if it does not end."""

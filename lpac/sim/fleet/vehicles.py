@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from types import TracebackType
 from typing import NamedTuple, Protocol, Self
 
 import numpy as np
@@ -32,12 +31,7 @@ class Vehicles(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
 
     def require_running(self) -> None:
         """Raises VehicleError if one has ended."""
@@ -82,13 +76,8 @@ class SimulatedVehicles:
             self._began_s = self._server.started_s
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._server.__exit__(kind, error, traceback)
+    def __exit__(self, *_: object) -> None:
+        self._server.__exit__()
 
     def require_running(self) -> None:
         """They end with this process."""

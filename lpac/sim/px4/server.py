@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from types import TracebackType
 
 from lpac.sim.px4.link import Px4Link
 
@@ -34,10 +33,9 @@ class Px4Server:
     `started_s` is the `time.monotonic()` of the vehicles' time 0, later by what had to be left out.
     """
 
-    def __init__(self, instances: Sequence[Instance], *, host: str = "127.0.0.1") -> None:
+    def __init__(self, instances: Sequence[Instance]) -> None:
         self.stepped = threading.Condition()
         self.started_s = 0.0
-        self._host = host
         self._instances = tuple(instances)
         self._sockets: list[socket.socket] = []
         self._selector = selectors.DefaultSelector()
@@ -51,7 +49,7 @@ class Px4Server:
             self._sockets.append(udp)
             udp.setblocking(False)
             try:
-                udp.bind((self._host, instance.listen_port))
+                udp.bind(("127.0.0.1", instance.listen_port))
             except OSError:
                 self._close()
                 raise
@@ -59,12 +57,7 @@ class Px4Server:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join()
         self._close()
@@ -123,7 +116,7 @@ class Px4Server:
 
     def _send(self, udp: socket.socket, datagram: bytes, port: int) -> None:
         try:
-            udp.sendto(datagram, (self._host, port))
+            udp.sendto(datagram, ("127.0.0.1", port))
         except (BlockingIOError, ConnectionRefusedError):
             # UDP: what nobody takes is lost.
             return

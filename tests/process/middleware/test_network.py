@@ -141,8 +141,8 @@ def test_for_people_it_is_a_table_that_says_where(tmp_path: Path) -> None:
         (["flights"], "flights: an experiment is one of restarts, robots"),
         (["--middleware", "ros"], "--middleware ros: must be one of zenoh, cyclonedds"),
         (["restarts", "-n", 1], "--robots 1: restarts needs at least 2"),
-        (["--repetitions", 0], "--repetitions 0: must be at least 1"),
-        (["--seconds", 0.5], "--seconds 0.5: must be at least 1"),
+        (["--repetitions", 0], "--repetitions = 0: must be at least 1"),
+        (["--seconds", 0.5], "--seconds = 0.5: must be at least 1"),
         (
             ["--namespaces", "a,b"],
             "--namespaces: 2 given, and 10 robots need one each: name more, or measure fewer",
