@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from lpac.cli.printing import BAD, FAINT, GOOD, lines_of, print_table, styled
+from lpac.cli.printing import BAD, FAINT, GOOD, LiveView, print_table, styled
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -156,38 +155,25 @@ def print_json(mapping: dict[str, object]) -> None:
 @contextmanager
 def _progress() -> Iterator[Callable[["CommandProgress"], None]]:
     """On stderr: a live table, or a line for each step where there is no terminal."""
-    from rich.console import Console
-    from rich.live import Live
-    from rich.table import Table
-
-    console = Console(stderr=True, highlight=False, markup=False)
-    began_s = time.monotonic()
     told: dict[str, str] = {}
 
-    def line(progress: "CommandProgress") -> None:
-        who = f"{progress.robot}  " if progress.robot else ""
-        console.print(f"{time.monotonic() - began_s:6.1f} s  {who}{progress.text}", soft_wrap=True)
-
     def table() -> "Table":
+        from rich.table import Table
+
         rows = Table.grid(padding=(0, 2, 0, 0))
         for robot, text in told.items():
             rows.add_row(styled(robot, ""), styled(text, FAINT))
         return rows
 
-    def keep(progress: "CommandProgress") -> None:
-        told[progress.robot] = progress.text
-
     def how_far() -> str:
-        last = "; ".join(f"{robot}  {text}".strip() for robot, text in list(told.items()))
-        return f"{time.monotonic() - began_s:6.1f} s  {last or 'nothing yet'}"
+        last = [f"{robot}  {text}".strip() for robot, text in list(told.items())]
+        return "; ".join(last) or "nothing yet"
 
-    def keep_and_print(progress: "CommandProgress") -> None:
-        keep(progress)
-        line(progress)
+    def on_progress(progress: "CommandProgress") -> None:
+        told[progress.robot] = progress.text
+        if not view.is_live:
+            view.line(f"{progress.robot}  {progress.text}".strip())
 
-    if not console.is_terminal:
-        with lines_of(how_far):
-            yield keep_and_print
-        return
-    with Live(get_renderable=table, console=console, transient=True):
-        yield keep
+    view = LiveView(table, how_far)
+    with view.shown():
+        yield on_progress

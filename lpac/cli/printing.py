@@ -1,6 +1,7 @@
 """Tables, notes and colours, as all commands print them."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import TYPE_CHECKING
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.progress import Progress
     from rich.table import Table
     from rich.text import Text
@@ -94,6 +96,47 @@ def lines_of(how_far: Callable[[], str]) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+class LiveView:
+    """On stderr: `render` again and again on a terminal; elsewhere a line of `how_far` at times.
+
+    Without `live` there is no live part on a terminal either, such as beside JSON on stdout.
+    """
+
+    def __init__(
+        self, render: Callable[[], "RenderableType"], how_far: Callable[[], str], *,
+        live: bool = True,
+    ) -> None:  # fmt: skip
+        from rich.console import Console
+        from rich.live import Live
+
+        self._console = Console(stderr=True, highlight=False, markup=False)
+        self._live = Live(get_renderable=render, console=self._console, transient=True)
+        self._how_far = how_far
+        self.is_live = live and self._console.is_terminal
+        self._began_s = time.monotonic()
+
+    def line(self, text: str) -> None:
+        """A line with the time since the view began, which stays."""
+        self._console.print(self._timed(text), soft_wrap=True)
+
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """The view, as long as this context lasts."""
+        with self._live if self.is_live else lines_of(lambda: self._timed(self._how_far())):
+            yield
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Nothing live, as long as this context lasts: a question is asked."""
+        self._live.stop()
+        yield
+        if self.is_live:
+            self._live.start()
+
+    def _timed(self, text: str) -> str:
+        return f"{time.monotonic() - self._began_s:6.1f} s  {text}"
 
 
 @contextmanager

@@ -2,10 +2,8 @@
 
 import asyncio
 import json
-import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import typer
@@ -14,16 +12,15 @@ from lpac.cli.printing import (
     BAD,
     FAINT,
     GOOD,
-    lines_of,
+    LiveView,
     new_table,
     plain,
     print_notes,
     print_table,
     styled,
-)  # fmt: skip
+)
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -159,12 +156,6 @@ def require_all(outcomes: Sequence["Outcome[T]"], done: str) -> None:
         )
 
 
-def _stderr() -> "Console":
-    from rich.console import Console
-
-    return Console(stderr=True, highlight=False, markup=False)
-
-
 @dataclass(slots=True)
 class _Row:
     """How far one robot is; `share` of the step is done where that is known."""
@@ -176,11 +167,11 @@ class _Row:
     outcome: tuple[str, str] | None = None
 
 
-@dataclass(slots=True)
 class _Progress:
-    rows: dict[str, _Row]
-    _console: "Console" = field(default_factory=_stderr)
-    _began_s: float = field(default_factory=time.monotonic)
+    def __init__(self, rows: dict[str, _Row]) -> None:
+        self.rows = rows
+        self._view = LiveView(self._table, self._how_far)
+        self.shown = self._view.shown
 
     def show(self, name: str, step: str, share: float | None) -> None:
         row = self.rows[name]
@@ -194,32 +185,17 @@ class _Progress:
             self._line(name, problem or "done")
         row.outcome = ("done", GOOD) if problem is None else (problem, BAD)
 
-    @contextmanager
-    def shown(self) -> Iterator[None]:
-        """The table, as long as this context lasts and if there is a terminal."""
-        from rich.live import Live
-
-        if not self._console.is_terminal:
-            with lines_of(self._how_far):
-                yield
-            return
-        with Live(get_renderable=self._table, console=self._console, transient=True):
-            yield
-
     def _how_far(self) -> str:
         """In one line, of those that are not done."""
-        shares = [
+        return "; ".join(
             f"{row.name}  {row.step}" + ("" if row.share is None else f" {row.share:.0%}")
             for row in list(self.rows.values())
             if row.outcome is None
-        ]
-        return f"{time.monotonic() - self._began_s:6.1f} s  {'; '.join(shares)}"
+        )
 
     def _line(self, name: str, text: str) -> None:
-        if not self._console.is_terminal:
-            self._console.print(
-                f"{time.monotonic() - self._began_s:6.1f} s  {name}  {text}", soft_wrap=True
-            )
+        if not self._view.is_live:
+            self._view.line(f"{name}  {text}")
 
     def _table(self) -> "Table":
         from rich.progress_bar import ProgressBar

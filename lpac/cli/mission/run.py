@@ -5,9 +5,6 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,11 +12,10 @@ import typer
 
 from lpac.cli.ground_requests import address, looking
 from lpac.cli.options import DEFAULT_FLEET, Fleet
-from lpac.cli.printing import BAD, FAINT, NOTABLE, lines_of, styled
+from lpac.cli.printing import BAD, FAINT, NOTABLE, LiveView, styled
 
 if TYPE_CHECKING:
-    from rich.console import Console, Group
-    from rich.live import Live
+    from rich.console import Group
 
     from lpac.ground.script import ScriptRun
     from lpac.ground.station.subscriber import GroundSubscriber
@@ -96,27 +92,18 @@ def _fly(flight: "ScriptRun", view: "_View") -> tuple[str, int]:
     return "", 0
 
 
-@dataclass(slots=True)
 class _View:
     """On stderr: step, time left, and robots on a terminal; a line for each step elsewhere."""
 
-    subscriber: "GroundSubscriber"
-    yes: bool
-    as_json: bool
-    robots: tuple[str, ...] = ()
-    _step: str = ""
-    _step_began_s: float = field(default_factory=time.monotonic)
-    _at_most_s: float | None = None
-    _began_s: float = field(default_factory=time.monotonic)
-    _console: "Console" = field(init=False)
-    _live: "Live" = field(init=False)
-
-    def __post_init__(self) -> None:
-        from rich.console import Console
-        from rich.live import Live
-
-        self._console = Console(stderr=True, highlight=False, markup=False)
-        self._live = Live(get_renderable=self._render, console=self._console, transient=True)
+    def __init__(self, subscriber: "GroundSubscriber", yes: bool, as_json: bool) -> None:
+        self.subscriber = subscriber
+        self.robots: tuple[str, ...] = ()
+        self._yes, self._as_json = yes, as_json
+        self._step, self._step_began_s = "", time.monotonic()
+        self._at_most_s: float | None = None
+        # On a terminal it would take what is printed to stdout to itself.
+        self._view = LiveView(self._render, self._how_far, live=not as_json)
+        self.shown, self.line = self._view.shown, self._view.line
 
     def step(self, name: str, at_most_s: float | None) -> None:
         """A step begins, and the one before is done."""
@@ -127,58 +114,35 @@ class _View:
 
     def end_step(self) -> None:
         """The step is done, if there is one."""
-        if self.as_json and self._step:
+        if self._as_json and self._step:
             duration_s = round(time.monotonic() - self._step_began_s, 3)
             typer.echo(json.dumps({"step": self._step, "duration_s": duration_s}))
         self._step = ""
 
-    def line(self, text: str) -> None:
-        """Something is worth a line, which stays."""
-        self._console.print(f"{time.monotonic() - self._began_s:7.1f} s  {text}", soft_wrap=True)
-
     def may(self, question: str) -> bool:
         """Ask the person at the terminal, between two trials."""
         self.end_step()
-        if self.yes:
+        if self._yes:
             return True
-        self._live.stop()
-        answer = typer.confirm(question, err=True)
-        self._start_live()
-        return answer
-
-    @contextmanager
-    def shown(self) -> Iterator[None]:
-        """The live part, as long as this context lasts and if there is a terminal."""
-        self._start_live()
-        try:
-            # With JSON lines there is no live part on a terminal either.
-            with nullcontext() if self._live.is_started else lines_of(self._how_far):
-                yield
-        finally:
-            self._live.stop()
+        with self._view.paused():
+            return typer.confirm(question, err=True)
 
     def _how_far(self) -> str:
         """The step, and what the robots do, in one line."""
-        now_s = time.monotonic()
-        clock = self._clock(now_s)
         states = Counter(
             "not heard" if robot.status is None or not robot.fresh else robot.status.state.value
             for robot in self.subscriber.snapshot.robots
             if robot.name in self.robots
         )
         doing = ", ".join(f"{count} {state}" for state, count in states.items())
-        return f"{now_s - self._began_s:7.1f} s  {self._step or 'script'}: {clock}: {doing}"
+        return f"{self._title()}: {doing}"
 
-    def _clock(self, now_s: float) -> str:
-        passed_s = now_s - self._step_began_s
+    def _title(self) -> str:
+        passed_s = time.monotonic() - self._step_began_s
+        title = f"{self._step or 'script'}: {passed_s:.0f} s"
         if self._at_most_s is None:
-            return f"{passed_s:.0f} s"
-        return f"{passed_s:.0f} s, {max(0.0, self._at_most_s - passed_s):.0f} s left"
-
-    def _start_live(self) -> None:
-        # It would take what is printed to stdout to itself.
-        if self._console.is_terminal and not self.as_json:
-            self._live.start()
+            return title
+        return f"{title}, {max(0.0, self._at_most_s - passed_s):.0f} s left"
 
     def _render(self) -> "Group":
         from rich.console import Group
@@ -202,5 +166,4 @@ class _View:
                 styled("" if status.battery is None else f"{status.battery:.0%}", FAINT),
                 styled(status.reason.text, FAINT),
             )
-        first = Text(f"{self._step or 'script'}: {self._clock(time.monotonic())}", "bold")
-        return Group(first, Text("Ctrl-C holds the fleet", "bold red"), rows)
+        return Group(Text(self._title(), "bold"), Text("Ctrl-C holds the fleet", "bold red"), rows)
