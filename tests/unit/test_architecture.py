@@ -106,7 +106,11 @@ ONLY_IN = {
     "typer": {"lpac/cli/"},
     "jinja2": {"lpac/analysis/template.py"},
     "markupsafe": {"lpac/analysis/template.py"},
-    "scipy": {"lpac/analysis/statistics.py"},
+    "scipy": {
+        "lpac/analysis/statistics.py",
+        "lpac/radio/calibration.py",
+        "lpac/sim/baselines.py",
+    },
     "rich": {"lpac/cli/", "lpac/ground/terminal/"},
     "textual": {"lpac/ground/terminal/"},
     "aiohttp": {"lpac/ground/map/"},
