@@ -185,9 +185,13 @@ def _control(
             service = await held.session.call(function, **arguments, **port)
             return _Controlled(held.found["current"], service, held.recovered)
 
+    outcomes = run_for_each(robots, one)
+    for outcome in outcomes:
+        if outcome.value and outcome.value.recovered and not as_json:
+            typer.echo(f"{outcome.robot.name}: {outcome.value.recovered}")
     tell(
-        config, run_for_each(robots, one), done, as_json=as_json, describe=_Controlled._asdict,
-        headings=("release", "flight"), note=lambda v: v.recovered,
+        config, outcomes, done, as_json=as_json, describe=_Controlled._asdict,
+        headings=("release", "flight"),
         cells=lambda v: ((v.release or "")[:SHORT], flight(v.service), program(v.service)),
     )  # fmt: skip
 

@@ -115,15 +115,12 @@ def tell(
     cells: Callable[[T], Sequence["str | Text"]],
     headings: Sequence[str] = (),
     numbers: Sequence[str] = (),
-    note: Callable[[T], str | None] = lambda _: None,
 ) -> None:
-    """Print JSON, or `print_outcomes` and notes; then `require_all`."""
+    """Print JSON, or `print_outcomes`; then `require_all`."""
     if as_json:
         print_json(config, outcomes, describe)
     else:
         print_outcomes(outcomes, cells, headings, numbers)
-        notes = [(o.robot.name, note(o.value)) for o in outcomes if o.value is not None]
-        print_notes([(name, text) for name, text in notes if text])
     require_all(outcomes, done)
 
 
