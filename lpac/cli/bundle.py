@@ -10,7 +10,7 @@ import typer
 from lpac.cli.apps import AsJson, new_app
 
 if TYPE_CHECKING:
-    from edge.policy.bundle import Manifest
+    from edge.policy.bundle import Bundle, Manifest
 
 app = new_app("bundle", "Look at a policy bundle; verify or time it on this machine.")
 
@@ -25,10 +25,15 @@ def info(path: BundlePath, as_json: AsJson = False) -> None:
     from edge.policy.bundle import MANIFEST, load_bundle
 
     bundle = load_bundle(path)
-    manifest, training = bundle.manifest, bundle.manifest.training
     if as_json:
         typer.echo(json.dumps({"id": bundle.id, **json.loads(bundle.files[MANIFEST])}, indent=2))
-        return
+    else:
+        show(bundle)
+
+
+def show(bundle: "Bundle") -> None:
+    """Print a line for each thing that the bundle holds."""
+    manifest, training = bundle.manifest, bundle.manifest.training
     rows = [
         ("name", manifest.name),
         ("id", bundle.id),

@@ -1,16 +1,14 @@
 """`lpac export`: a trained torch checkpoint becomes a bundle."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.bundle import show
 from lpac.cli.options import found
 from lpac.cli.printing import working
-
-if TYPE_CHECKING:
-    from edge.policy.bundle import Bundle
 
 app = new_app()
 
@@ -54,24 +52,5 @@ def export(
     with working("exporting"):
         bundle = export_bundle(checkpoint, params, name, cnn=cnn, force=force)
     write_bundle(bundle, output)
-    _show(bundle, output)
-
-
-def _show(bundle: "Bundle", output: Path) -> None:
-    from edge.policy.lpac.manifest import LpacManifest
-
-    manifest, lpac = bundle.manifest, LpacManifest.of(bundle.manifest)
-    geometry, images = lpac.geometry, lpac.images
-    perception = (
-        f"{images.size} x {images.size} images of {', '.join(images.channels)}"
-        if images
-        else "none: this checkpoint has no CNN"
-    )
-    size_mb = sum(map(len, bundle.files.values())) / 1e6
-    typer.echo(f"{output}: {manifest.name}, bundle {bundle.id}")
-    typer.echo(
-        f"  network     L = {geometry.layers}, K = {geometry.hops}, "
-        f"features {' -> '.join(map(str, geometry.feature_sizes))}"
-    )
-    typer.echo(f"  perception  {perception}")
-    typer.echo(f"  files       {', '.join(sorted(bundle.files))} ({size_mb:.1f} MB)")
+    typer.echo(f"{output}:")
+    show(bundle)

@@ -261,10 +261,7 @@ def _flight(path: Path, program: "FlightMetadata", flight: "FlightReplay") -> di
         "differing": flight.differing,
         "differences": [
             {
-                "what": d.differing.what,
-                "then": d.differing.then,
-                "now": d.differing.now,
-                "is_rounding": d.differing.is_rounding,
+                **d.differing._asdict(),
                 "ticks": d.ticks,
                 "since_unix_s": d.since_unix_s,
                 "until_unix_s": d.until_unix_s,

@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
@@ -94,11 +95,8 @@ def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJso
     config, chosen = open_fleet(fleet, robots)
     chosen = _without_spares(config, chosen, "rolled back")
 
-    async def one(robot: "RobotHost", report: "Report") -> str:
-        return await roll_back(config, robot, report)
-
     tell(
-        config, run_for_each(chosen, one), "rolled back on", as_json=as_json,
+        config, run_for_each(chosen, partial(roll_back, config)), "rolled back on", as_json=as_json,
         headings=("release",), cells=lambda release: (release, styled("rolled back", GOOD)),
         describe=lambda release: {"release": release},
     )  # fmt: skip

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from edge.messages.mission import RobotStatus
     from lpac.analysis.snapshot import FleetSnapshot
-    from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
     from lpac.fleet.settings import FleetConfig, RobotHost
     from lpac.fleet.wifi import BulkStream, Interface
@@ -198,10 +197,7 @@ def _read_wifi(
 ) -> "list[Outcome[list[Interface]]]":
     from lpac.fleet.wifi import read_wifi
 
-    async def one(robot: "RobotHost", report: "Report") -> "list[Interface]":
-        return await read_wifi(config, robot, report)
-
-    outcomes = run_for_each(robots, one) if robots else []
+    outcomes = run_for_each(robots, partial(read_wifi, config)) if robots else []
     if any(outcome.interrupted for outcome in outcomes):
         raise KeyboardInterrupt
     return outcomes
