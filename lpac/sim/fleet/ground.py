@@ -1,7 +1,6 @@
 """`lpac ground` as a program beside the simulator, just as an operator runs it."""
 
 import signal
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,28 +9,26 @@ from typing import Self
 from lpac.ground.station.client import GroundError, command, socket_path
 from lpac.ground.station.protocol import CommandReport, Request
 from lpac.ground.station.subscriber import GroundSubscriber
-from lpac.sim.programs import python_program
+from lpac.sim.programs import LpacProgram
 
 _START_WITHIN_S = 60.0
 _END_WITHIN_S = 10.0
 _TRY_AGAIN_S = 0.05
 
 
-class GroundProgram:
+class GroundProgram(LpacProgram):
     """One `lpac ground`; a context, in which it runs. `told` is what it tells its clients.
 
-    `pid` is its process. What it prints is in ground.log beside the fleet's file.
+    What it prints is in ground.log beside the fleet's file.
     """
-
-    pid: int
 
     def __init__(self, fleet_toml: Path, fleet: str, name: str = "sim") -> None:
         """`fleet` is the fleet's name in its file, `name` the station's."""
+        super().__init__(
+            fleet_toml.with_name("ground.log"),
+            "ground", "--fleet", str(fleet_toml), "--name", name,
+        )  # fmt: skip
         self.fleet = fleet
-        self._fleet_toml = fleet_toml
-        self._name = name
-        self._log = fleet_toml.with_name("ground.log")
-        self._process: subprocess.Popen[bytes] | None = None
         self._told: GroundSubscriber | None = None
 
     def __enter__(self) -> Self:
@@ -52,11 +49,6 @@ class GroundProgram:
         assert self._told is not None
         return self._told
 
-    @property
-    def running(self) -> bool:
-        """Whether it has not ended."""
-        return self._process is not None and self._process.poll() is None
-
     def command(
         self, request: Request, meanwhile: Callable[[], None] = lambda: None
     ) -> CommandReport:
@@ -68,32 +60,16 @@ class GroundProgram:
 
     def start(self) -> None:
         """Start it, also again, on what it left on its disk. Raises GroundError if it does not."""
-        with self._log.open("ab") as output:
-            self._process = subprocess.Popen(
-                python_program("lpac.cli.main", "ground",
-                               "--fleet", str(self._fleet_toml), "--name", self._name),
-                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                # Ctrl-C is for the launcher alone, which lands the vehicles first.
-                process_group=0,
-            )  # fmt: skip
-        self.pid = self._process.pid
+        super().start()
         self._listen()
-
-    def kill(self) -> None:
-        """It ends like a computer whose battery is empty."""
-        assert self._process is not None
-        self._process.kill()
-        self._process.wait()
 
     def suspend(self) -> None:
         """It stands still, like a laptop that sleeps."""
-        assert self._process is not None
-        self._process.send_signal(signal.SIGSTOP)
+        self.send_signal(signal.SIGSTOP)
 
     def wake(self) -> None:
         """It goes on. Raises GroundError if it tells nothing then."""
-        assert self._process is not None
-        self._process.send_signal(signal.SIGCONT)
+        self.send_signal(signal.SIGCONT)
         self._listen()
 
     def _listen(self) -> None:
@@ -111,23 +87,16 @@ class GroundProgram:
             except GroundError:
                 # It is not open yet, and nothing tells when it is.
                 if not self.running or time.monotonic() > until_s:
-                    text = f"`lpac ground` does not start: {self._last_words()}"
+                    text = f"`lpac ground` does not start: {self.last_words()}"
                     raise GroundError(text) from None
                 time.sleep(_TRY_AGAIN_S)
-
-    def _last_words(self) -> str:
-        lines = self._log.read_text(errors="replace").splitlines()
-        return next((line for line in reversed(lines) if line.strip()), "it printed nothing")
 
     def _end(self) -> None:
         if self._told is not None:
             self._told.__exit__(None, None, None)
-        if self._process is not None and self.running:
-            self._process.send_signal(signal.SIGTERM)
-            self._process.send_signal(signal.SIGCONT)
-            try:
-                self._process.wait(_END_WITHIN_S)
-            except subprocess.TimeoutExpired:
+        if self.running:
+            self.terminate()
+            if self.wait(_END_WITHIN_S) is None:
                 self.kill()
         # Nobody flies this fleet again: what a ground leaves for the next one is not needed.
         path = socket_path(self.fleet)

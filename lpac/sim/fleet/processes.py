@@ -4,7 +4,6 @@ import math
 import os
 import signal
 import socket
-import subprocess
 import time
 from collections import deque
 from contextlib import ExitStack
@@ -20,7 +19,7 @@ from lpac.sim.fleet.layout import WORLD, Layout, Settings
 from lpac.sim.fleet.listener import FleetListener, Say
 from lpac.sim.fleet.vehicles import SimulatedVehicles, Vehicles
 from lpac.sim.ports import free_ports
-from lpac.sim.programs import python_program
+from lpac.sim.programs import LpacProgram
 from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import Px4Build
 
@@ -71,62 +70,33 @@ class Usage(NamedTuple):
     peak_memory_mb: float
 
 
-class RobotProcess:
+class RobotProcess(LpacProgram):
     """One `lpac robot run`; `folder` holds robot.toml, what it prints (robot.log), its flight log.
 
-    `name` is what people call the robot; `running` tells whether it has not ended yet.
+    `name` is what people call the robot.
     """
 
     def __init__(self, robot_id: int, folder: Path) -> None:
+        super().__init__(
+            folder / "robot.log", "robot", "run", "--config", str(folder / "robot.toml")
+        )
         self.robot_id = robot_id
         self.name = f"r{robot_id}"
         self.folder = folder
-        self._process: subprocess.Popen[bytes] | None = None
         self._first_start_unix_s = math.inf
 
     def start(self) -> None:
         """Start the program, also again after it has ended."""
-        first = self._process is None
-        if first:
+        if not math.isfinite(self._first_start_unix_s):
             self._first_start_unix_s = time.time()
-        with (self.folder / "robot.log").open("wb" if first else "ab") as output:
-            self._process = subprocess.Popen(
-                python_program("lpac.cli.main", "robot", "run",
-                               "--config", str(self.folder / "robot.toml")),
-                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                # Ctrl-C is for the launcher alone, which lands the vehicles first.
-                process_group=0,
-            )  # fmt: skip
-
-    @property
-    def running(self) -> bool:
-        return self._process is not None and self._process.poll() is None
-
-    @property
-    def pid(self) -> int:
-        """Raises RuntimeError if the program was never started."""
-        if self._process is None:
-            raise RuntimeError(f"{self.name} was not started")
-        return self._process.pid
-
-    def send_signal(self, number: signal.Signals) -> None:
-        """Send a signal; nothing happens if the program has ended."""
-        if self._process is not None:
-            self._process.send_signal(number)
+            self.log.unlink(missing_ok=True)
+        super().start()
 
     def kill_watchdog(self) -> None:
         """The process that watches it, its only child, ends like kill -9."""
         for children in Path(f"/proc/{self.pid}/task").glob("*/children"):
             for child in children.read_text().split():
                 os.kill(int(child), signal.SIGKILL)
-
-    def wait(self, timeout_s: float) -> int | None:
-        """The exit code once the program has ended, None if it has not within the time."""
-        assert self._process is not None
-        try:
-            return self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            return None
 
     def usage(self) -> Usage:
         """Nothing if the program has ended."""
@@ -140,35 +110,20 @@ class RobotProcess:
             if path.stat().st_mtime >= self._first_start_unix_s
         )
 
-    def ending(self) -> str:
-        """How the program has ended, in words; with the last line that it printed, if by itself."""
-        code = self.wait(0.0)
-        if code is not None and code < 0:
-            return f"by {signal.Signals(-code).name}"
-        log = self.folder / "robot.log"
-        lines = log.read_text(errors="replace").split("\n") if log.exists() else []
-        last = next((line for line in reversed(lines) if line.strip()), "it printed nothing")
-        return f"exit code {code}: {last}"
 
-
-class RouterProcess:
+class RouterProcess(LpacProgram):
     """`lpac fleet router`: a context, in which it runs; what it prints is in router.log."""
 
     def __init__(self, fleet_toml: Path, port: int) -> None:
-        self._fleet_toml = fleet_toml
+        super().__init__(
+            fleet_toml.with_name("router.log"), "fleet", "router", "--fleet", str(fleet_toml)
+        )
         self._port = port
-        self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
-        with (self._fleet_toml.parent / "router.log").open("ab") as output:
-            self._process = subprocess.Popen(
-                python_program("lpac.cli.main", "fleet", "router",
-                               "--fleet", str(self._fleet_toml)),
-                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                process_group=0,
-            )  # fmt: skip
+        self.start()
         # Robots would wait for it, and say so.
-        while self._process.poll() is None:
+        while self.running:
             with socket.socket() as probe:
                 if probe.connect_ex(("127.0.0.1", self._port)) == 0:
                     break
@@ -176,13 +131,9 @@ class RouterProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
-        assert self._process is not None
-        self._process.terminate()
-        try:
-            self._process.wait(STOP_WITHIN_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self.terminate()
+        if self.wait(STOP_WITHIN_S) is None:
+            self.kill()
 
 
 def process_usage(pid: int) -> Usage:
@@ -352,11 +303,9 @@ class Fleet:
     def _stop_robots(self) -> None:
         running = [robot for robot in self.robots if robot.running]
         for robot in running:
-            robot.send_signal(signal.SIGTERM)
-            robot.send_signal(signal.SIGCONT)
+            robot.terminate()
         until_s = time.monotonic() + STOP_WITHIN_S
         for robot in running:
             if robot.wait(max(0.0, until_s - time.monotonic())) is None:
                 self._say(f"{robot.name} did not end within {STOP_WITHIN_S:g} s: killed")
-                robot.send_signal(signal.SIGKILL)
-                robot.wait(STOP_WITHIN_S)
+                robot.kill()
