@@ -2,9 +2,10 @@
 
 import contextlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from edge.core.counted import counted
@@ -54,10 +55,14 @@ class Wanted:
 
 
 class Examined(NamedTuple):
-    """The missions in some logs as records, and what a reader should know of these."""
+    """The missions in some logs as records, and what a reader should know of these.
+
+    `without_cost` says of each mission whose cost is not known why that is.
+    """
 
     records: tuple[FlightRecord, ...]
     notes: tuple[str, ...]
+    without_cost: Mapping[str, str] = MappingProxyType({})
 
     def summary(self) -> dict[str, Any]:
         """Summary as JSON values."""
@@ -84,8 +89,9 @@ def examine(
     notes = list(logs.notes)
     worlds = _Worlds(logs, paths, wanted, notes)
     fences = {m.robot_id: _fence(m) for m in logs.metadata}
-    records = []
+    records, without_cost = [], {}
     for index, mission in enumerate(chosen):
+        before = len(notes)
         progress(f"examining {mission.name}", index / len(chosen))
         record = record_of(
             logs, mission, [other for other in missions if other is not mission],
@@ -93,7 +99,10 @@ def examine(
         )  # fmt: skip
         notes += _notes(logs, record, wanted)
         records.append(record)
-    return Examined(tuple(records), tuple(notes))
+        if not len(record.normalized):
+            why = "; ".join(notes[before:])
+            without_cost[record.name] = why or f"{record.name}: no cost is known"
+    return Examined(tuple(records), tuple(notes), without_cost)
 
 
 def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission]:

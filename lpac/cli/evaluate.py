@@ -20,7 +20,7 @@ from lpac.cli.options import (
     found,
     require_here,
 )
-from lpac.cli.study import fly_study
+from lpac.cli.study import StudyTask, fly_study
 from lpac.cli.transport import WifiFile, calibration, transport_named, wifi_lines
 
 if TYPE_CHECKING:
@@ -158,10 +158,11 @@ def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
         px4_build="" if options.px4 is None else str(options.px4.resolve()),
     )
     sources = {name: source._asdict() for name, source in calibrated.sources.items()}
-    fly_study(
-        study, "evaluation", options.out, options.ray, as_json=options.as_json,
-        compared=options.compare, further={"wifi_from": sources if hard.transports else None},
+    task = StudyTask(
+        name="evaluation", study=study, folder=options.out, compared=options.compare,
+        further={"wifi_from": sources if hard.transports else None},
     )  # fmt: skip
+    fly_study(task, options.ray, as_json=options.as_json)
     if hard.transports and not options.as_json:
         typer.echo("\n".join(["what the model assumes of the Wi-Fi:", *wifi_lines(calibrated)]))
 

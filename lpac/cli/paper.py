@@ -2,11 +2,10 @@
 
 import json
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,18 +22,17 @@ from lpac.cli.options import (
     pool,
     require_here,
 )
-from lpac.cli.study import fly_study, show_report
+from lpac.cli.study import StudyTask, fly_study, fly_together, show_report
 
 if TYPE_CHECKING:
-    from edge.policy.bundle import Bundle as LoadedBundle
     from lpac.analysis.flight import FlightRecord
-    from lpac.study.report import Report
 
 app = new_app("paper", "Repeat the paper's experiments, and run some that its arguments call for.")
 
 _OUT = Path("out/paper")
 # By this `lpac paper all` knows what it made itself, and need not make again.
 _MADE_FOR_ALL = "made_by.json"
+_IN_THE_AIR = ("e1", "e2", "e3", "transfer", "async")
 # Robots, repetitions, s.
 _QUICK_NETWORK = (3, 1, 8.0)
 _Out = Annotated[
@@ -158,28 +156,35 @@ def _experiment(
     """Fly it, or read it from logs. `changes` are what else was given, or None."""
     given = {key: value for key, value in changes.items() if value is not None}
     _check(name, options, given, quick=quick)
-    folder, bundles = options.out or _OUT / name, options.bundles or [DEFAULT_BUNDLE]
     if options.logs is not None:
-        _from_logs(name, options.logs, options, folder)
+        _from_logs(name, options.logs, options)
         return
+    task = _task(name, options, given, quick=quick)
+    fly_study(task, options.ray, as_json=options.as_json)
+    (task.folder / _MADE_FOR_ALL).unlink(missing_ok=True)
+
+
+def _task(
+    name: str, options: ExperimentOptions, given: Mapping[str, Any], *, quick: bool
+) -> StudyTask:
+    """The experiment, changed as `given`; and the command that repeats it."""
     from lpac.paper.experiments import experiment
 
+    bundles, vehicle = options.bundles or [DEFAULT_BUNDLE], options.vehicle
+    changes = dict(given)
     study = experiment(
-        name, bundles, engine=options.vehicle.value, px4_build=options.px4, quick=quick,
-        set_ups=given.pop("set_ups", ()),
+        name, bundles, engine=vehicle.value, px4_build=options.px4, quick=quick,
+        set_ups=changes.pop("set_ups", ()),
     )  # fmt: skip
-    study = replace(study, **given)
-    made = [f"{_OPTIONS[key]} {value}" for key, value in given.items()]
-    made += [f"--set-up {its}" for its in changes.get("set_ups") or ()]
+    made = [] if vehicle is VehicleKind.POINT else [f"--vehicle {vehicle.value}"]
+    made += [f"{_OPTIONS[key]} {value}" for key, value in changes.items()]
+    made += [f"--set-up {its}" for its in given.get("set_ups", ())]
     made += [f"--bundle {path}" for path in bundles if path != DEFAULT_BUNDLE]
     made += ["--quick"] if quick else []
-    command = " ".join(["paper", name, *_vehicle(options.vehicle), *made])
-    fly_study(study, name, folder, options.ray, as_json=options.as_json, command=command)
-    (folder / _MADE_FOR_ALL).unlink(missing_ok=True)
-
-
-def _vehicle(vehicle: VehicleKind) -> list[str]:
-    return [] if vehicle is VehicleKind.POINT else [f"--vehicle {vehicle.value}"]
+    return StudyTask(
+        name=name, study=replace(study, **changes), folder=options.out or _OUT / name,
+        command=" ".join(["paper", name, *made]),
+    )  # fmt: skip
 
 
 def _check(name: str, options: ExperimentOptions, given: Mapping[str, Any], *, quick: bool) -> None:
@@ -204,23 +209,24 @@ def _check(name: str, options: ExperimentOptions, given: Mapping[str, Any], *, q
         raise ValueError(f"{option} does nothing without --logs")
 
 
-class Logged(NamedTuple):
-    """Missions of logs by name, the bundle that flew, and where the report goes."""
-
-    records: "dict[str, FlightRecord]"
-    bundle: Path
-    logs: Path
-    folder: Path
-    made_by: dict[str, str]
-
-
-def _from_logs(name: str, logs: Path, options: ExperimentOptions, folder: Path) -> None:
+def _from_logs(name: str, logs: Path, options: ExperimentOptions) -> None:
     """The same of the missions in logs."""
+    from lpac.paper.logged import REPORTS, LoggedMissions, ids_in
+    from lpac.study.provenance import made_by
+
+    folder = options.out or _OUT / name
     bundle = options.bundles[0] if options.bundles else None
-    records = _logged(logs, options, bundle)
-    made_by = _made_from_logs(name, logs, options, bundle, records)
-    logged = Logged(records, bundle or DEFAULT_BUNDLE, logs, folder, made_by)
-    report = _reports[name](logged)
+    records = _missions(logs, options, bundle)
+    words = ["paper", name, "--logs", str(logs)]
+    words += [word for its in options.trial or () for word in ("--trial", its)]
+    words += ["--world-file", str(options.world_file)] if options.world_file is not None else []
+    words += ["--bundle", str(bundle)] if bundle is not None else []
+    report = REPORTS[name](
+        LoggedMissions(
+            records=records, bundle=bundle or DEFAULT_BUNDLE, logs=logs, folder=folder,
+            made_by=made_by(shlex.join(words), ids_in(records)), pool=pool(None), note=_note,
+        )
+    )  # fmt: skip
     told = report.write(folder)
     if options.as_json:
         typer.echo(json.dumps(told, indent=2))
@@ -228,7 +234,7 @@ def _from_logs(name: str, logs: Path, options: ExperimentOptions, folder: Path) 
         show_report(report, folder)
 
 
-def _logged(
+def _missions(
     logs: Path, options: ExperimentOptions, bundle: Path | None
 ) -> "dict[str, FlightRecord]":
     """The missions in the logs below a folder, by name. Raises ValueError if one has no cost."""
@@ -239,130 +245,17 @@ def _logged(
         world_option="--world-file",
     )  # fmt: skip
     examined = examine([logs], wanted)
-    for record in examined.records:
-        if not len(record.normalized):
-            why = [note for note in examined.notes if note.startswith(f"{record.name}: ")]
-            others = "; or choose other missions with --trial" if len(examined.records) > 1 else ""
-            raise ValueError("; ".join(why or [f"{record.name}: no cost is known"]) + others)
+    if examined.without_cost:
+        why = next(iter(examined.without_cost.values()))
+        others = "; or choose other missions with --trial" if len(examined.records) > 1 else ""
+        raise ValueError(f"{why}{others}")
     for note in examined.notes:
-        typer.echo(f"note: {note}", err=True)
+        _note(note)
     return {record.name: record for record in examined.records}
 
 
-def _e1_of_logs(of: Logged) -> "Report":
-    """Each mission that the bundle flew beside the baselines."""
-    from edge.policy.bundle import load_bundle
-    from lpac.paper.logged import baselines_beside, e1_of_logs
-    from lpac.study.flights import sizes_of
-    from lpac.study.study import BASELINES
-
-    bundle = load_bundle(of.bundle)
-    others = [name for name, record in of.records.items() if _ids_in({name: record}) != [bundle.id]]
-    if others:
-        typer.echo(
-            f"note: {of.bundle} is not what flew {', '.join(others)}, so what baselines would see "
-            "there is not known: they are left out; give the bundle that flew with --bundle",
-            err=True,
-        )
-    own = {name: record for name, record in of.records.items() if name not in others}
-    beside = baselines_beside(own, of.bundle, sizes_of(bundle), BASELINES, pool(None))
-    by_mission = {n: {"flight": record, **beside.get(n, {})} for n, record in of.records.items()}
-    return e1_of_logs(by_mission, of.folder, of.made_by)
-
-
-def _e2_of_logs(of: Logged) -> "Report":
-    from lpac.paper.logged import e2_of_logs
-
-    if len(of.records) < 2:
-        raise ValueError(f"missions in {of.logs}: {len(of.records)}: must be at least 2")
-    return e2_of_logs(of.records, of.folder, of.made_by)
-
-
-def _e3_of_logs(of: Logged) -> "Report":
-    from lpac.paper.logged import e3_of_logs
-    from lpac.sim.description import FIELD_SCALE
-
-    if len(of.records) > 1:
-        raise ValueError(f"{of.logs}: has {', '.join(of.records)}: choose one mission with --trial")
-    bundle = _that_flew(of.bundle, of.records, "which says how far robots hear each other")
-    assert bundle.manifest.perception is not None
-    range_m = bundle.manifest.perception.communication_range / FIELD_SCALE.env_scale
-    [record] = of.records.values()
-    return e3_of_logs(record, range_m, of.folder, of.made_by)
-
-
-def _async_of_logs(of: Logged) -> "Report":
-    """What the missions came to by their rates; says which are left out."""
-    from lpac.paper.logged import async_of_logs
-    from lpac.study.rates import LOGGED_S, is_comparable
-
-    bundle = _that_flew(of.bundle, of.records, "which says how much robots say")
-    for name, record in of.records.items():
-        if not is_comparable(record):
-            why = (
-                "its robots' rates differ, or are not in their logs"
-                if record.rates is None
-                else f"it lasted {record.curve_time_s[-1]:.0f} s, less than {LOGGED_S:g}"
-            )
-            typer.echo(f"note: {name} is left out: {why}", err=True)
-    return async_of_logs(of.records, bundle, of.folder, of.made_by)
-
-
-def _transfer_of_logs(of: Logged) -> "Report":
-    from lpac.paper.logged import transfer_of_logs
-
-    bundle = _that_flew(of.bundle, of.records, "which says what baselines see")
-    return transfer_of_logs(of.records, bundle, of.bundle, pool(None), of.folder, of.made_by)
-
-
-_reports = {
-    "e1": _e1_of_logs, "e2": _e2_of_logs, "e3": _e3_of_logs, "async": _async_of_logs,
-    "transfer": _transfer_of_logs,
-}  # fmt: skip
-
-
-def _ids_in(records: "Mapping[str, FlightRecord]") -> list[str]:
-    """The ids of the bundles that flew."""
-    robots = [robot for record in records.values() for robot in record.robots]
-    return sorted({said.bundle_id for robot in robots for said in robot.said})
-
-
-def _that_flew(path: Path, records: "Mapping[str, FlightRecord]", why: str) -> "LoadedBundle":
-    """Raises ValueError if another bundle flew, or it cannot fly."""
-    from edge.policy.bundle import load_bundle
-
-    bundle, flown = load_bundle(path), _ids_in(records)
-    if bundle.manifest.perception is None:
-        raise ValueError(f"{path}: has no perception: it cannot fly")
-    if len(flown) > 1:
-        raise ValueError(
-            f"{' and '.join(its[:16] for its in flown)} flew: choose missions of one bundle with "
-            "--trial"
-        )
-    if bundle.id not in flown:
-        raise ValueError(
-            f"{path}: is not what flew, {flown[0][:16]}: give that with --bundle, {why}"
-        )
-    return bundle
-
-
-def _made_from_logs(
-    name: str,
-    logs: Path,
-    options: ExperimentOptions,
-    bundle: Path | None,
-    records: "Mapping[str, FlightRecord]",
-) -> dict[str, str]:
-    from lpac.study.provenance import made_by
-
-    given = [
-        ("--logs", str(logs)),
-        *(("--trial", its) for its in options.trial or ()),
-        *(("--world-file", str(its)) for its in [options.world_file] if its is not None),
-        *(("--bundle", str(its)) for its in [bundle] if its is not None),
-    ]
-    said = (f"{option} {shlex.quote(value)}" for option, value in given)
-    return made_by(" ".join(["paper", name, *said]), _ids_in(records))
+def _note(text: str) -> None:
+    typer.echo(f"note: {text}", err=True)
 
 
 @app.command()
@@ -390,15 +283,15 @@ def network(
         as_json=as_json,
         out=folder,
     )
-    command = " ".join(["paper network", *_for_network(namespaces, quick=quick)])
     told = json.loads((folder / "network.json").read_text())
+    command = _network_command(namespaces, quick=quick)
     network_report(told, made_by(command, [])).write(folder)
     (folder / _MADE_FOR_ALL).unlink(missing_ok=True)
 
 
-def _for_network(namespaces: str | None, *, quick: bool) -> list[str]:
+def _network_command(namespaces: str | None, *, quick: bool) -> str:
     chosen = [] if namespaces is None else [f"--namespaces {namespaces}"]
-    return [*chosen, *(["--quick"] if quick else [])]
+    return " ".join(["paper network", *chosen, *(["--quick"] if quick else [])])
 
 
 @app.command("all")
@@ -423,31 +316,39 @@ def everything(
     folder, loaded = out or _OUT, load_bundle(bundle)
     # Known before hours of flights.
     require_namespaces(namespaces, _QUICK_NETWORK[0] if quick else None)
-    told = {}
-    for name in ("e1", "e2", "e3", "transfer", "async"):
-        flown = ExperimentOptions(bundles=[bundle], ray=ray, out=folder / name)
-        small = quick and name in ("transfer", "async")
-        if not quick and name in ("e1", "e2", "e3"):
-            flown = replace(flown, vehicle=VehicleKind.SIMULATED)
-        command = ["paper", name, *_vehicle(flown.vehicle), *(["--quick"] if small else [])]
-        told[name] = made_by(" ".join(command), [loaded.id])
-        fly = partial(_experiment, name, flown, {}, quick=small)
-        _unless_made(name, folder / name, told[name], fly)
-    command = ["paper network", *_for_network(namespaces, quick=quick)]
-    told["network"] = made_by(" ".join(command), [])
-    measure = partial(network, quick=quick, namespaces=namespaces, out=folder / "network")
-    _unless_made("network", folder / "network", told["network"], measure)
+    tasks = [_task_of_all(name, bundle, folder, quick=quick) for name in _IN_THE_AIR]
+    told = {task.name: made_by(task.command, [loaded.id]) for task in tasks}
+    told["network"] = made_by(_network_command(namespaces, quick=quick), [])
+    missing = [task for task in tasks if not _is_made(task.folder, told[task.name])]
+    reports = fly_together(missing, folder, ray) if missing else []
+    for task, report in zip(missing, reports, strict=True):
+        typer.echo(f"{task.name}\n")
+        show_report(report, task.folder)
+        typer.echo()
+        _note_made(task.folder, told[task.name])
+    if not _is_made(folder / "network", told["network"]):
+        typer.echo("network\n")
+        network(quick=quick, namespaces=namespaces, out=folder / "network")
+        typer.echo()
+        _note_made(folder / "network", told["network"])
     typer.echo(f"see {write_page(folder, loaded, told)}")
 
 
-def _unless_made(
-    name: str, folder: Path, made_by: dict[str, str], make: Callable[[], None]
-) -> None:
-    """Results are made again only if they were made otherwise."""
+def _task_of_all(name: str, bundle: Path, folder: Path, *, quick: bool) -> StudyTask:
+    of_few_flights = name in ("e1", "e2", "e3")
+    whole = of_few_flights and not quick
+    options = ExperimentOptions(
+        bundles=[bundle], out=folder / name,
+        vehicle=VehicleKind.SIMULATED if whole else VehicleKind.POINT,
+    )  # fmt: skip
+    return _task(name, options, {}, quick=quick and not of_few_flights)
+
+
+def _is_made(folder: Path, made_by: Mapping[str, str]) -> bool:
+    """Whether what is there was made so; else it is made again."""
     kept = folder / _MADE_FOR_ALL
-    if kept.exists() and json.loads(kept.read_text()) == made_by:
-        return
-    typer.echo(f"{name}\n")
-    make()
-    typer.echo()
-    kept.write_text(json.dumps(made_by) + "\n")
+    return kept.exists() and json.loads(kept.read_text()) == made_by
+
+
+def _note_made(folder: Path, made_by: Mapping[str, str]) -> None:
+    (folder / _MADE_FOR_ALL).write_text(json.dumps(made_by) + "\n")

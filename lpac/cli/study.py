@@ -3,9 +3,9 @@
 import json
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from lpac.study.report import Report
+    from lpac.study.run import Flown
     from lpac.study.study import Study
 
 app = new_app()
@@ -53,49 +54,76 @@ def study(
 
         fly_faults(read_drill(file), out or _OUT / file.stem, px4, ray, as_json=as_json)
         return
-    fly_study(read_study(file, px4), file.stem, out or _OUT / file.stem, ray, as_json=as_json)
+    task = StudyTask(name=file.stem, study=read_study(file, px4), folder=out or _OUT / file.stem)
+    fly_study(task, ray, as_json=as_json)
 
 
-def fly_study(
-    study: "Study",
-    name: str,
-    folder: Path,
-    ray: str | None,
-    *,
-    as_json: bool,
-    command: str | None = None,
-    compared: bool = False,
-    further: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Fly a study, write its report, and print it; gives its JSON, which `further` is put into."""
-    from lpac.study.provenance import made_by_study
-    from lpac.study.run import run_with_records
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudyTask:
+    """A study to fly, and its report in `folder`, with `further` in the JSON.
+
+    The report says that the `command` made it, else the one that was typed. With `compared` the
+    first method is set against the second.
+    """
+
+    name: str
+    study: "Study"
+    folder: Path
+    command: str = ""
+    compared: bool = False
+    further: Mapping[str, Any] = field(default_factory=dict)
+
+
+def fly_study(task: StudyTask, ray: str | None, *, as_json: bool) -> None:
+    """Fly a study, write its report, and print it."""
+    [report] = fly_together([task], task.folder, ray)
+    if as_json:
+        typer.echo(json.dumps(report.document, indent=2))
+        return
+    show_report(report, task.folder)
+    if (opened := report.told["test_set_opened"]) is not None:
+        beside = "if you choose by this, it is no test set any more"
+        typer.echo(f"the test set was opened, {opened['worlds']} worlds of it: {beside}")
+
+
+def fly_together(tasks: Sequence[StudyTask], folder: Path, ray: str | None) -> "list[Report]":
+    """Fly studies, each flight once, and write their reports; `folder` keeps what was flown."""
+    from lpac.study.run import run_together
 
     # A worker process that draws nothing does not load what draws, and a mistake is told by now.
     cores = pool(ray)
     folder.mkdir(parents=True, exist_ok=True)
+    by_name = {task.name: task for task in tasks}
+    studies = {name: task.study for name, task in by_name.items()}
+    flown, reports = {}, {}
     with folder_lock("the study", folder), telling("flights") as tell:
-        flown = run_with_records(study, cores, folder, tell)
-    from lpac.study.summary import draw_worst, report_of, sections_of
+        for name, its in run_together(studies, cores, folder, tell):
+            # Drawn while the others fly.
+            flown[name], reports[name] = its, _written(by_name[name], its)
+    for name, task in by_name.items():
+        if "worst" in task.study.figures:
+            from lpac.study.summary import draw_worst
 
+            with telling("pictures of the worst worlds") as tell:
+                draw_worst(task.study, flown[name].results, task.folder, cores, tell)
+    return [reports[name] for name in by_name]
+
+
+def _written(task: StudyTask, flown: "Flown") -> "Report":
+    """The report, in its folder."""
+    from lpac.study.provenance import made_by_study
+    from lpac.study.summary import report_of, sections_of
+
+    study, folder = task.study, task.folder
     sections = sections_of(study, flown, folder)
-    made_by = made_by_study(command or shlex.join(sys.argv[1:]), study)
-    report = report_of(name, study, flown.results, sections, folder, made_by, compared=compared)
-    report = replace(
-        report, told={**report.told, "test_set_opened": _opened(study), **(further or {})}
+    made_by = made_by_study(task.command or shlex.join(sys.argv[1:]), study)
+    report = report_of(
+        task.name, study, flown.results, sections, folder, made_by, compared=task.compared
     )
-    told = report.write(folder)
-    if "worst" in study.figures:
-        with telling("pictures of the worst worlds") as tell:
-            draw_worst(study, flown.results, folder, cores, tell)
-    if as_json:
-        typer.echo(json.dumps(told, indent=2))
-        return told
-    show_report(report, folder)
-    if (opened := told["test_set_opened"]) is not None:
-        beside = "if you choose by this, it is no test set any more"
-        typer.echo(f"the test set was opened, {opened['worlds']} worlds of it: {beside}")
-    return told
+    told = {**report.told, "test_set_opened": _opened(study), **task.further}
+    report = replace(report, told=told)
+    report.write(folder)
+    return report
 
 
 def show_report(report: "Report", folder: Path) -> None:

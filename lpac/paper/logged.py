@@ -1,7 +1,7 @@
 """The paper's experiments, from the logs of flights."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +9,9 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.counted import counted
-from edge.policy.bundle import Bundle
+from edge.policy.bundle import Bundle, load_bundle
 from lpac.analysis.flight import FlightRecord
+from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Pool
 from lpac.sim.description import FIELD_SCALE
 from lpac.sim.experiment import cost_times_s
@@ -18,7 +19,7 @@ from lpac.sim.scenario import Scenario
 from lpac.study.flights import CLAIRVOYANT, PlannedFlight, fly_all, records_of, sizes_of
 from lpac.study.hearing_robot import message_bytes
 from lpac.study.perturbation import absences_of, perturbed_by
-from lpac.study.rates import rates, results_of_logs
+from lpac.study.rates import LOGGED_S, is_comparable, rates, results_of_logs
 from lpac.study.report import Report
 from lpac.study.results import FAILS_ABOVE, MethodResult, conditions_json
 from lpac.study.sections import Section, perturbation, repeatability, snapshots
@@ -41,8 +42,78 @@ _TAKEN = (
 _TRIAL_S = 40.0
 
 
-def baselines_beside(
-    records: Mapping[str, FlightRecord], bundle: Path, sizes: str, names: Sequence[str], pool: Pool
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoggedMissions:
+    """Missions in the logs below a folder, by name, and the path of the bundle that flew them.
+
+    The report goes to `folder`, and says what it was `made_by`. Points fly over the `pool`. `note`
+    hears what a person should know besides.
+    """
+
+    records: Mapping[str, FlightRecord]
+    bundle: Path
+    logs: Path
+    folder: Path
+    made_by: Mapping[str, str]
+    pool: Pool
+    note: Callable[[str], object]
+
+    def that_flew(self, why: str) -> Bundle:
+        """The bundle; `why` says what it is needed for.
+
+        Raises ValueError if another one flew, or it cannot fly.
+        """
+        bundle, flown = load_bundle(self.bundle), ids_in(self.records)
+        if bundle.manifest.perception is None:
+            raise ValueError(f"{self.bundle}: has no perception: it cannot fly")
+        if len(flown) > 1:
+            raise ValueError(
+                f"{' and '.join(its[:16] for its in flown)} flew: choose missions of one bundle "
+                "with --trial"
+            )
+        if bundle.id not in flown:
+            raise ValueError(
+                f"{self.bundle}: is not what flew, {flown[0][:16]}: give that with --bundle, {why}"
+            )
+        return bundle
+
+    def report(self, name: str, title: str, section: Section, flown: str) -> Report:
+        """What one section tells."""
+        return Report(
+            name=name, title=title, text=flown, told=section.told, rows=section.rows,
+            tables=section.tables, figures=section.figures, flown=flown, made_by=self.made_by,
+        )  # fmt: skip
+
+
+def ids_in(records: Mapping[str, FlightRecord]) -> list[str]:
+    """The ids of the bundles that flew."""
+    robots = [robot for record in records.values() for robot in record.robots]
+    return sorted({said.bundle_id for robot in robots for said in robot.said})
+
+
+def _e1(of: LoggedMissions) -> Report:
+    """E1: each mission, beside the baselines over its world if the bundle flew it."""
+    bundle = load_bundle(of.bundle)
+    others = [name for name, record in of.records.items() if ids_in({name: record}) != [bundle.id]]
+    if others:
+        of.note(
+            f"{of.bundle} is not what flew {', '.join(others)}, so what baselines would see there "
+            "is not known: they are left out; give the bundle that flew with --bundle"
+        )
+    own = {name: record for name, record in of.records.items() if name not in others}
+    beside = _baselines_beside(own, of, sizes_of(bundle), BASELINES)
+    by_mission = {
+        name: {"flight": record, **beside.get(name, {})} for name, record in of.records.items()
+    }
+    section = snapshots(by_mission, of.folder)
+    return of.report("e1", "E1, transferability", section, _BESIDE_POINTS if beside else LOGS)
+
+
+def _baselines_beside(
+    records: Mapping[str, FlightRecord],
+    of: LoggedMissions,
+    sizes: str,
+    names: Sequence[BaselineName],
 ) -> dict[str, dict[str, FlightRecord]]:
     """Baselines over the world of each logged flight, from where its robots began, as points.
 
@@ -50,19 +121,18 @@ def baselines_beside(
     there, or that nobody began, are left out.
     """
     flights = {
-        (trial, name): PlannedFlight(scenario=scenario, bundle=str(bundle), flown_by=sizes)
-        for trial, record in records.items()
-        for name, scenario in _beside(record).items()
-        if name in names
+        (mission, name): PlannedFlight(scenario=scenario, bundle=str(of.bundle), flown_by=sizes)
+        for mission, record in records.items()
+        for name, scenario in _beside(record, names).items()
     }
-    flown = dict(fly_all(records_of, list(dict.fromkeys(flights.values())), pool))
+    flown = dict(fly_all(records_of, list(dict.fromkeys(flights.values())), of.pool))
     found: dict[str, dict[str, FlightRecord]] = {}
-    for (trial, name), flight in flights.items():
-        found.setdefault(trial, {})[name] = flown[flight]
+    for (mission, name), flight in flights.items():
+        found.setdefault(mission, {})[name] = flown[flight]
     return found
 
 
-def _beside(record: FlightRecord) -> dict[str, Scenario]:
+def _beside(record: FlightRecord, names: Sequence[BaselineName]) -> dict[str, Scenario]:
     starts_m = tuple(record.places_at(0.0).values())
     if record.coverage is None or not record.coverage.features or not starts_m:
         return {}
@@ -77,71 +147,67 @@ def _beside(record: FlightRecord) -> dict[str, Scenario]:
             scale=replace(FIELD_SCALE, env_scale=coverage.cells_per_m),
             duration_s=record.duration_s,
         )
-        for name in BASELINES
+        for name in names
     }
 
 
-def e1_of_logs(
-    records: Mapping[str, Mapping[str, FlightRecord]], folder: Path, made_by: Mapping[str, str]
-) -> Report:
-    """E1: missions by name, each beside the baselines over its world."""
-    beside = any(len(of_world) > 1 for of_world in records.values())
-    flown = _BESIDE_POINTS if beside else LOGS
-    return _report("e1", "E1, transferability", snapshots(records, folder), flown, made_by)
+def _e2(of: LoggedMissions) -> Report:
+    """E2: each mission is a trial. Raises ValueError if there is only one."""
+    if len(of.records) < 2:
+        raise ValueError(f"missions in {of.logs}: {len(of.records)}: must be at least 2")
+    section = repeatability(of.records, of.folder, _TRIAL_S)
+    return of.report("e2", "E2, repeatability", section, LOGS)
 
 
-def e2_of_logs(
-    records: Mapping[str, FlightRecord], folder: Path, made_by: Mapping[str, str]
-) -> Report:
-    """E2: each mission is a trial."""
-    section = repeatability(records, folder, _TRIAL_S)
-    return _report("e2", "E2, repeatability", section, LOGS, made_by)
+def _e3(of: LoggedMissions) -> Report:
+    """E3: robots are away while pilots have them.
+
+    Raises ValueError if nobody was, or there are several missions.
+    """
+    if len(of.records) > 1:
+        raise ValueError(f"{of.logs}: has {', '.join(of.records)}: choose one mission with --trial")
+    perception = of.that_flew("which says how far robots hear each other").manifest.perception
+    assert perception is not None
+    range_m = perception.communication_range / FIELD_SCALE.env_scale
+    [record] = of.records.values()
+    section = perturbation(perturbed_by(record, absences_of(record), range_m), of.folder)
+    return of.report("e3", "E3, perturbation", section, _TAKEN)
 
 
-def e3_of_logs(
-    record: FlightRecord, range_m: float, folder: Path, made_by: Mapping[str, str]
-) -> Report:
-    """E3: robots are away while pilots have them. Raises ValueError if nobody was."""
-    section = perturbation(perturbed_by(record, absences_of(record), range_m), folder)
-    return _report("e3", "E3, perturbation", section, _TAKEN, made_by)
-
-
-def async_of_logs(
-    records: Mapping[str, FlightRecord], bundle: Bundle, folder: Path, made_by: Mapping[str, str]
-) -> Report:
+def _async(of: LoggedMissions) -> Report:
     """Missions by the rates that they were flown at. Raises ValueError."""
-    section = rates(results_of_logs(records), message_bytes(bundle, 2), folder, paired=False)
-    return _report("async", "Rates and asynchrony", section, _BY_RATES, made_by)
+    bundle = of.that_flew("which says how much robots say")
+    for name, record in of.records.items():
+        if not is_comparable(record):
+            why = (
+                "its robots' rates differ, or are not in their logs"
+                if record.rates is None
+                else f"it lasted {record.curve_time_s[-1]:.0f} s, less than {LOGGED_S:g}"
+            )
+            of.note(f"{name} is left out: {why}")
+    said = message_bytes(bundle, 2)
+    section = rates(results_of_logs(of.records), said, of.folder, paired=False)
+    return of.report("async", "Rates and asynchrony", section, _BY_RATES)
 
 
-def _report(
-    name: str, title: str, section: Section, flown: str, made_by: Mapping[str, str]
-) -> Report:
-    return Report(
-        name=name, title=title, text=flown, told=section.told, rows=section.rows,
-        tables=section.tables, figures=section.figures, flown=flown, made_by=made_by,
-    )  # fmt: skip
-
-
-def transfer_of_logs(
-    records: Mapping[str, FlightRecord], bundle: Bundle, path: Path, pool: Pool, folder: Path,
-    made_by: Mapping[str, str],
-) -> Report:  # fmt: skip
+def _transfer(of: LoggedMissions) -> Report:
     """Missions by team, how many robots and features, beside ClairvoyantCVT's flights.
 
     Raises ValueError if nobody was in the air as one began.
     """
-    beside = baselines_beside(records, path, sizes_of(bundle), [CLAIRVOYANT], pool)
-    for name in records:
+    bundle = of.that_flew("which says what baselines see")
+    beside = _baselines_beside(of.records, of, sizes_of(bundle), [CLAIRVOYANT])
+    for name in of.records:
         if name not in beside:
             raise ValueError(f"{name}: nobody was in the air as it began: choose other missions")
     clairvoyant = {name: its[CLAIRVOYANT] for name, its in beside.items()}
-    policy = Method(name="lpac", trainings=(TrainedBundle(str(path.resolve()), bundle.id),))
-    results = teams_of_logs(records, clairvoyant, policy)
+    path = str(of.bundle.resolve())
+    policy = Method(name="lpac", trainings=(TrainedBundle(path, bundle.id),))
+    results = _by_team(of.records, clairvoyant, policy)
     told: dict[str, Any] = {
         "world_set": None,
         "first_world": 0,
-        "worlds": len(records),
+        "worlds": len(of.records),
         "trials_per_world": 1,
         "methods": [
             {"name": policy.name, "bundles": [each._asdict() for each in policy.trainings]},
@@ -150,15 +216,12 @@ def transfer_of_logs(
         "fails_above": FAILS_ABOVE,
         "conditions": conditions_json(results),
     }
-    return Report(
-        name="transfer", title="Transfer to other teams and worlds", text=_BESIDE_POINTS,
-        told=told, rows=rows_of(told), tables=tables_of(told),
-        figures=draw_conditions(results, folder), flown=_BESIDE_POINTS, legend=LEGEND,
-        made_by=made_by,
-    )  # fmt: skip
+    section = Section(told, tables_of(told), draw_conditions(results, of.folder), rows_of(told))
+    title = "Transfer to other teams and worlds"
+    return replace(of.report("transfer", title, section, _BESIDE_POINTS), legend=LEGEND)
 
 
-def teams_of_logs(
+def _by_team(
     missions: Mapping[str, FlightRecord], clairvoyant: Mapping[str, FlightRecord], policy: Method
 ) -> dict[Condition, list[MethodResult]]:
     """By team, the smallest first: the missions that the policy flew, and ClairvoyantCVT's flights.
@@ -199,3 +262,9 @@ def teams_of_logs(
 def _curves(records: Sequence[FlightRecord], time_s: F64) -> F64:
     """(1, K, C): normalised costs."""
     return np.array([[np.interp(time_s, r.curve_time_s, r.normalized) for r in records]])
+
+
+REPORTS: Mapping[str, Callable[[LoggedMissions], Report]] = {
+    "e1": _e1, "e2": _e2, "e3": _e3, "async": _async,
+    "transfer": _transfer,
+}  # fmt: skip

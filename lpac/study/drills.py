@@ -134,7 +134,7 @@ def fly_drill(
     """
     one = flights[0]
     do = outcomes_of if one.engine == "simulated" else partial(_in_worker, folder=folder)
-    kept = KeptFlights(folder, do, FlightOutcome, lambda outcome: not outcome.error)
+    kept = KeptFlights(folder, FlightOutcome, lambda outcome: not outcome.error)
     at_once = 1
     # PX4's ports are the same for all fleets.
     if one.engine == "mavlink":
@@ -142,7 +142,7 @@ def fly_drill(
     beside = partial(over_processes, at_most=max(1, at_once))
     outcomes: dict[PlannedFlight, FlightOutcome] = {}
     broken = 0
-    with closing(kept.fly(flights, pool, beside)) as flown:
+    with closing(kept.fly(do, flights, pool, beside)) as flown:
         for flight, outcome in flown:
             outcomes[flight] = outcome
             broken += not outcome.held

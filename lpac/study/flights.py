@@ -16,6 +16,7 @@ import edge
 import lpac
 from edge.policy.bundle import Bundle, BundleError
 from lpac.analysis.flight import FlightRecord
+from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Outcome, Pool, in_this_process
 from lpac.sim.engines import IN_REAL_TIME, EngineName, engine_of, loaded_bundle
 from lpac.sim.experiment import cost_times_s
@@ -24,7 +25,7 @@ from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import build_digest
 
 POLICY = "lpac"
-CLAIRVOYANT = "clairvoyant-cvt"
+CLAIRVOYANT: BaselineName = "clairvoyant-cvt"
 # Larger batches of the simulator are no faster.
 _ROBOTS_TOGETHER = 80
 _FLIGHTS = "flights.jsonl"
@@ -109,6 +110,10 @@ def groups_of(flights: Iterable[PlannedFlight]) -> list[FlightGroup]:
     return [*groups, *(tuple(waiting) for waiting in alike.values() if waiting)]
 
 
+def _robot_seconds(group: FlightGroup) -> float:
+    return sum(flight.scenario.robots * flight.scenario.duration_s for flight in group)
+
+
 def require_planned(flight: PlannedFlight) -> None:
     """Raise ValueError if another bundle is at its path than when the flight was planned."""
     if loaded_bundle(flight.bundle).id != flight.flown_by:
@@ -153,10 +158,11 @@ def fly_all(
 ) -> Generator[tuple[PlannedFlight, Outcome], None, None]:
     """Each flight as it is done, with what `do` makes of its group.
 
-    Flights in real time have a pool of their own, and nothing of the other beside them.
+    The largest groups are begun first, so that in the end no core waits long for another. Flights
+    in real time have a pool of their own, and nothing of the other beside them.
     """
     groups: dict[bool, list[FlightGroup]] = {False: [], True: []}
-    for group in groups_of(flights):
+    for group in sorted(groups_of(flights), key=_robot_seconds, reverse=True):
         groups[group[0].engine in IN_REAL_TIME].append(group)
     for its_pool, its in ((pool, groups[False]), (in_real_time, groups[True])):
         if its:
@@ -170,36 +176,44 @@ class KeptFlights(Generic[Outcome]):
     def __init__(
         self,
         folder: Path,
-        do: FlyGroup[Outcome],
         kind: type[Outcome],
         is_kept: Callable[[Outcome], bool] = lambda _: True,
     ) -> None:
-        """`do` flies them, and gives named tuples of this kind: a folder has those of one alone.
+        """Outcomes are named tuples of this kind: a folder has those of one alone.
 
         What `is_kept` does not want is flown again. Raises OSError.
         """
-        self._do, self._is_kept = do, is_kept
+        self._is_kept = is_kept
         self._kept = KeptOutcomes(folder / _FLIGHTS, {"code": code_digest(edge, lpac)})
         self._outcomes = {
             line["flight"]: msgspec.convert(line["outcome"], kind) for line in self._kept.lines
         }
 
+    def known(self, flights: Iterable[PlannedFlight]) -> dict[PlannedFlight, Outcome]:
+        """Those of them that were flown before."""
+        return {each: self._outcomes[each.key] for each in flights if each.key in self._outcomes}
+
+    def keep(self, flight: PlannedFlight, outcome: Outcome) -> None:
+        """What came of one more. Raises OSError."""
+        if self._is_kept(outcome) and flight.key not in self._outcomes:
+            self._outcomes[flight.key] = outcome
+            told = {"flight": flight.key, "fault": flight.fault}
+            self._kept.add({**told, "seed": flight.scenario.seed, "outcome": outcome})
+
     def fly(
-        self, flights: Sequence[PlannedFlight], pool: Pool, in_real_time: Pool = in_this_process
+        self,
+        do: FlyGroup[Outcome],
+        flights: Sequence[PlannedFlight],
+        pool: Pool,
+        in_real_time: Pool = in_this_process,
     ) -> Generator[tuple[PlannedFlight, Outcome], None, None]:
         """All of them: first what was flown before, and then the others as they come."""
-        missing = []
-        for flight in flights:
-            if flight.key in self._outcomes:
-                yield flight, self._outcomes[flight.key]
-            else:
-                missing.append(flight)
-        with closing(fly_all(self._do, missing, pool, in_real_time)) as flown:
+        known = self.known(flights)
+        yield from known.items()
+        missing = [flight for flight in flights if flight not in known]
+        with closing(fly_all(do, missing, pool, in_real_time)) as flown:
             for flight, outcome in flown:
-                if self._is_kept(outcome):
-                    self._outcomes[flight.key] = outcome
-                    told = {"flight": flight.key, "fault": flight.fault}
-                    self._kept.add({**told, "seed": flight.scenario.seed, "outcome": outcome})
+                self.keep(flight, outcome)
                 yield flight, outcome
 
 

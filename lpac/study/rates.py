@@ -206,7 +206,6 @@ def rates(
         {"times_s": list(times_s), "timings": [_json(message_bytes, each) for each in results]},
         [Table(headings, rows, "Rate by rate", note)],
         shown,
-        [],
         _rows(message_bytes, results),
     )
 

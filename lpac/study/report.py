@@ -45,15 +45,19 @@ class Report:
     legend: str = ""
     made_by: Mapping[str, str]
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """The JSON."""
+        return {**self.told, "flown": self.flown, "made_by": dict(self.made_by)}
+
     def write(self, folder: Path) -> dict[str, Any]:
         """NAME.json, NAME.csv and README.md; gives the JSON. Raises OSError."""
-        document = {**self.told, "flown": self.flown, "made_by": dict(self.made_by)}
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{self.name}.json").write_text(json.dumps(document, indent=2) + "\n")
+        (folder / f"{self.name}.json").write_text(json.dumps(self.document, indent=2) + "\n")
         write_csv(self.rows, folder / f"{self.name}.csv")
         told = {name: getattr(self, name) for name in self.__slots__}
         (folder / "README.md").write_text(render("lpac.study", "report.md", **told))
-        return document
+        return self.document
 
 
 def write_csv(rows: Sequence[Sequence[object]], path: Path) -> None:

@@ -1,19 +1,19 @@
 """Studies, flown."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from lpac.analysis.flight import FlightRecord
-from lpac.sim.cores import Outcome, Pool, in_this_process
+from lpac.sim.cores import Pool, in_this_process
 from lpac.study.flights import (
     CostCurve,
+    FlightGroup,
     KeptFlights,
     PlannedFlight,
     curve_of,
-    curves_of,
     fly_all,
     records_of,
 )
@@ -47,31 +47,71 @@ def run(
     Raises BundleError, ValueError, and OSError if the folder cannot be written.
     """
     flights = study.flights()
-    keeper = KeptFlights(folder, curves_of, CostCurve) if folder else None
-    flown = keeper.fly(flights, pool) if keeper else fly_all(curves_of, flights, pool)
-    return results_of(study, _all(flown, len(flights), tell))
+    curves: dict[PlannedFlight, CostCurve] = {}
+    with closing(_flown(flights, frozenset(), pool, folder)) as flown:
+        for flight, (curve, _) in flown:
+            curves[flight] = curve
+            tell(len(curves), len(flights))
+    return results_of(study, curves)
 
 
-def run_with_records(study: Study, pool: Pool, folder: Path, tell: Tell) -> Flown:
-    """As `run`, with the record of each flight if the study's figures are of these.
+def run_together(
+    studies: Mapping[str, Study], pool: Pool, folder: Path, tell: Tell
+) -> Iterator[tuple[str, Flown]]:
+    """As `run`, of several studies: each, by its name, once all of it is flown.
 
-    Records are not kept: they are flown again. Programs in real time leave their logs in `folder`.
+    What two of them fly is flown once, and nobody waits for one before the next is begun. With the
+    record of each flight if a study's figures are of these. Records are not kept: they are flown
+    again. Programs in real time leave their logs in `folder`.
     """
-    if not study.needs_records:
-        return Flown(run(study, pool, folder=folder, tell=tell), {})
-    flights = study.flights()
-    flown = fly_all(partial(records_of, logs=folder), flights, pool)
-    records = _all(flown, len(flights), tell)
-    curves = {flight: curve_of(flight, record) for flight, record in records.items()}
-    return Flown(results_of(study, curves), records)
+    missing = {name: set(study.flights()) for name, study in studies.items()}
+    whole = frozenset(f for name, s in studies.items() if s.needs_records for f in missing[name])
+    flights = list(dict.fromkeys(f for study in studies.values() for f in study.flights()))
+    curves: dict[PlannedFlight, CostCurve] = {}
+    records: dict[PlannedFlight, FlightRecord] = {}
+    with closing(_flown(flights, whole, pool, folder)) as flown:
+        for flight, (curve, record) in flown:
+            curves[flight] = curve
+            if record is not None:
+                records[flight] = record
+            tell(len(curves), len(flights))
+            for name, study in studies.items():
+                if missing[name] == {flight}:
+                    own = study.flights() if study.needs_records else ()
+                    yield name, Flown(results_of(study, curves), {f: records[f] for f in own})
+                missing[name].discard(flight)
 
 
-def _all(
-    flown: Generator[tuple[PlannedFlight, Outcome], None, None], of: int, tell: Tell
-) -> dict[PlannedFlight, Outcome]:
-    outcomes = {}
-    with closing(flown):
+class _Outcome(NamedTuple):
+    curve: CostCurve
+    record: FlightRecord | None
+
+
+def _flown(
+    flights: Sequence[PlannedFlight],
+    whole: frozenset[PlannedFlight],
+    pool: Pool,
+    folder: Path | None,
+) -> Generator[tuple[PlannedFlight, _Outcome], None, None]:
+    """Each flight as it comes, those that are `whole` with their records."""
+    kept = KeptFlights(folder, CostCurve) if folder else None
+    known = kept.known(flight for flight in flights if flight not in whole) if kept else {}
+    for flight, curve in known.items():
+        yield flight, _Outcome(curve, None)
+    missing = [flight for flight in flights if flight not in known]
+    with closing(fly_all(partial(_outcomes_of, whole=whole, logs=folder), missing, pool)) as flown:
         for flight, outcome in flown:
-            outcomes[flight] = outcome
-            tell(len(outcomes), of)
-    return outcomes
+            if kept:
+                kept.keep(flight, outcome.curve)
+            yield flight, outcome
+
+
+def _outcomes_of(
+    group: FlightGroup, whole: frozenset[PlannedFlight], logs: Path | None
+) -> list[tuple[PlannedFlight, _Outcome]]:
+    """Fly them, in whatever process this is, which also computes the costs."""
+    flown = records_of(group, logs if group[0] in whole else None)
+    return [
+        (flight, _Outcome(curve_of(flight, record), record if flight in whole else None))
+        for flight, record in flown
+    ]

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,13 @@ _SNAPSHOTS_S = (0.0, 0.25, 0.5, 1.0)
 class Section:
     """What a report tells of flights.
 
-    `told` is for scripts, `lines` are for the terminal, `rows` are the CSV's, its heading first.
+    `told` is for scripts, `rows` are the CSV's, its heading first.
     """
 
     told: Mapping[str, Any]
     tables: Sequence[Table]
     figures: Sequence[Picture]
-    lines: Sequence[str]
-    rows: Sequence[Sequence[object]] = field(default_factory=list)
+    rows: Sequence[Sequence[object]]
 
 
 def snapshots(records: Mapping[str, Mapping[str, FlightRecord]], folder: Path) -> Section:
@@ -60,11 +59,6 @@ def snapshots(records: Mapping[str, Mapping[str, FlightRecord]], folder: Path) -
         [Table(["", *names], rows, "World by world",
                f"The cost at the end, and in brackets that of the true positions. {_COSTS}")],
         [Picture("snapshots.png", "snapshots"), Picture("costs.png", "costs")],
-        [
-            f"{world}: "
-            + ", ".join(f"{name} {record.normalized[-1]:.3f}" for name, record in its.items())
-            for world, its in records.items()
-        ],
         curves_csv(named),
     )  # fmt: skip
 
@@ -108,12 +102,6 @@ def repeatability(trials: Mapping[str, FlightRecord], folder: Path, duration_s: 
         },
         [Table(headings, rows, "Trial by trial", note)],
         [Picture("repeatability.png", "cost of all trials, and where robots end")],
-        [
-            f"cost after {spread['end_s']:.0f} s",
-            *(f"{name}: {one.normalized[-1]:.3f}" for name, one in seen.items()),
-            f"mean {spread['final_mean']:.3f}, standard deviation {spread['final_deviation']:.3f}",
-            *who_is_missing(spread),
-        ],
         curves_csv(seen),
     )
 
@@ -155,10 +143,6 @@ def perturbation(flight: PerturbedFlight, folder: Path) -> Section:
         },
         [Table(headings, rows, "Robots away, and back", note)],
         [Picture("perturbation.png", "cost, neighbours and speeds")],
-        [
-            f"{who}: {before} before, {worst} at worst, {end} in the end, settled after {settled}"
-            for who, _, before, worst, end, settled in rows
-        ],
         csv_rows,
     )
 

@@ -102,7 +102,7 @@ class Selection:
         """`config` is the digest of the run's. Raises OSError."""
         self._select = select
         self._task = task
-        self._flights = KeptFlights(folder, task.costs, CostCurve)
+        self._flights = KeptFlights(folder, CostCurve)
         self._kept = KeptOutcomes(folder / "candidates.jsonl", {"config": config})
 
     @property
@@ -166,7 +166,7 @@ class Selection:
     def _fly(self, flights: list[PlannedFlight], pool: Pool, tell: Callable[[int], None]) -> F64:
         """The cost of each at the end, over that at the start."""
         flown: dict[PlannedFlight, float] = {}
-        with closing(self._flights.fly(flights, pool)) as outcomes:
+        with closing(self._flights.fly(self._task.costs, flights, pool)) as outcomes:
             for flight, told in outcomes:
                 flown[flight] = told.cost[-1] / told.cost[0]
                 tell(len(flown))

@@ -73,7 +73,7 @@ def test_a_study_over_a_cluster_flies_the_same(cluster: Cluster, tmp_path: Path)
     condition = Condition(scenario=FIELD.scenario(duration_s=1.0))
     study = Study(methods=(Method.of("field", SHIPPED),), conditions=(condition,), worlds=1)
     flown = dict(
-        KeptFlights(tmp_path, curves_of, CostCurve).fly(study.flights(), over_ray(cluster.address))
+        KeptFlights(tmp_path, CostCurve).fly(curves_of, study.flights(), over_ray(cluster.address))
     )
     assert flown == dict(pair for flight in study.flights() for pair in curves_of((flight,)))
 

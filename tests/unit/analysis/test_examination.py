@@ -363,6 +363,7 @@ def test_without_a_world_there_is_no_cost(tmp_path: Path) -> None:
     (values,) = found.summary()["trials"]
     assert values["cost"]["initial"] is None and values["end_m"].keys() == {"r0", "r1", "r2"}
     assert [f"world {id_of(WORLD)} is not here" in note for note in found.notes] == [True]
+    assert found.without_cost == {"t1": found.notes[0]}
     write(found, tmp_path / "out", (0.0,), lambda *_: None)
     assert (tmp_path / "out/t1/snapshots.png").exists()
     assert not (tmp_path / "out/t1/cost.png").exists()
@@ -370,6 +371,7 @@ def test_without_a_world_there_is_no_cost(tmp_path: Path) -> None:
     other.write_text("CircularBND 100 100 20 5\n")
     given = examined(tmp_path, world=other)
     assert given.summary()["trials"][0]["cost"]["initial"] is not None
+    assert not given.without_cost
     assert [f"--world is {id_of(other.read_text())}" in note for note in given.notes] == [True]
 
 

@@ -60,7 +60,8 @@ def day(mission: FlightRecord, monkeypatch: pytest.MonkeyPatch) -> list[Wanted]:
         other = replace(mission, name="paper-2", coverage=None)
         trials = [t for t in (mission, other) if not wanted.missions or t.name in wanted.missions]
         note = f"paper-2: world 1234 is not here; give it with {wanted.world_option}"
-        return Examined(tuple(trials), (note,))
+        without_cost = {trial.name: note for trial in trials if not len(trial.normalized)}
+        return Examined(tuple(trials), (note,), without_cost)
 
     monkeypatch.setattr(lpac.analysis.examination, "examine", examine)
     return asked

@@ -56,8 +56,8 @@ def test_what_was_judged_is_kept_and_the_rest_flown_again(tmp_path: Path) -> Non
         return [(flight, outcome_of(flight)) for flight in group]
 
     for _ in range(2):
-        kept = KeptFlights(tmp_path, do, FlightOutcome, lambda outcome: not outcome.error)
-        told = dict(kept.fly(flights, in_this_process))
+        kept = KeptFlights(tmp_path, FlightOutcome, lambda outcome: not outcome.error)
+        told = dict(kept.fly(do, flights, in_this_process))
         assert told == {flight: outcome_of(flight) for flight in flights}
     assert flown == [0, 1, 2, 2]
 
@@ -78,8 +78,8 @@ def test_flights_in_real_time_have_a_pool_of_their_own(tmp_path: Path) -> None:
     def do(group: FlightGroup) -> list[tuple[PlannedFlight, FlightOutcome]]:
         return [(flight, outcome_of(flight)) for flight in group]
 
-    kept = KeptFlights(tmp_path, do, FlightOutcome)
-    assert len(dict(kept.fly(flights, refuse, in_this_process))) == 2
+    kept = KeptFlights(tmp_path, FlightOutcome)
+    assert len(dict(kept.fly(do, flights, refuse, in_this_process))) == 2
 
 
 def test_a_report_says_what_broke_and_how_it_is_flown_again(tmp_path: Path) -> None:

@@ -168,20 +168,20 @@ def test_policies_fly_together_and_nothing_gets_lost() -> None:
 
 def test_what_was_flown_is_kept(tmp_path: Path) -> None:
     flight = flight_of()
-    first = dict(KeptFlights(tmp_path, curves_of, CostCurve).fly([flight], in_this_process))
+    first = dict(KeptFlights(tmp_path, CostCurve).fly(curves_of, [flight], in_this_process))
 
     def refuse(do: object, tasks: Sequence[object]) -> Generator[Outcome, None, None]:
         raise AssertionError(f"{tasks} were flown")
         yield
 
-    assert dict(KeptFlights(tmp_path, curves_of, CostCurve).fly([flight], refuse)) == first
+    assert dict(KeptFlights(tmp_path, CostCurve).fly(curves_of, [flight], refuse)) == first
     # What another version of the code has flown does not count.
     path = tmp_path / "flights.jsonl"
     came_of, *lines = path.read_text().splitlines()
     other = json.dumps({**json.loads(came_of), "code": "x"})
     path.write_text("\n".join([other, *lines]) + "\n")
     with pytest.raises(AssertionError, match="were flown"):
-        dict(KeptFlights(tmp_path, curves_of, CostCurve).fly([flight], refuse))
+        dict(KeptFlights(tmp_path, CostCurve).fly(curves_of, [flight], refuse))
     assert first[flight] == CostCurve(*first[flight]) and len(first[flight].cost) == 2
 
 

@@ -1,12 +1,18 @@
 """From a study to its results."""
 
+import itertools
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from edge.policy.bundle import BundleError
-from lpac.study.run import run
+from lpac.sim.cores import Outcome, Task, in_this_process
+from lpac.study.flights import PlannedFlight
+from lpac.study.run import run, run_together
 from lpac.study.study import Condition, Method, Study
 from lpac.study.worlds import SET_UPS
 from tests.conftest import SHIPPED
@@ -37,6 +43,36 @@ def test_a_folder_keeps_what_was_flown(tmp_path: Path) -> None:
             np.testing.assert_array_equal(one.curves, other.curves)
     lines = (tmp_path / "flights.jsonl").read_text().splitlines()
     assert len(lines) == 1 + flights  # the first says of which code
+
+
+def test_what_studies_share_is_flown_once_and_those_that_need_records_have_them(
+    tmp_path: Path,
+) -> None:
+    part = replace(STUDY, worlds=1, figures=("snapshots",))
+    groups: list[Any] = []
+
+    def pool(
+        do: Callable[[Task], Outcome], tasks: Sequence[Task]
+    ) -> Generator[Outcome, None, None]:
+        groups.extend(tasks)
+        return in_this_process(do, tasks)
+
+    def flown() -> set[PlannedFlight]:
+        return set(itertools.chain.from_iterable(groups))
+
+    told: list[tuple[int, int]] = []
+    studies = {"all": STUDY, "part": part}
+    of_each = dict(run_together(studies, pool, tmp_path, lambda *done: told.append(done)))
+    assert flown() == {*STUDY.flights()} and told[-1] == (6, 6)
+    assert sum(map(len, groups)) == 6
+    for name, study in studies.items():
+        for one, other in zip(of_each[name].results[CONDITION], run(study)[CONDITION], strict=True):
+            np.testing.assert_array_equal(one.curves, other.curves)
+    assert not of_each["all"].records and {*of_each["part"].records} == {*part.flights()}
+    # Costs are kept, and records are not.
+    groups.clear()
+    assert of_each.keys() == dict(run_together(studies, pool, tmp_path, lambda *_: None)).keys()
+    assert flown() == {*part.flights()}
 
 
 def test_a_method_needs_its_bundles() -> None:
