@@ -11,16 +11,17 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 
 from edge.core import F64
 from edge.core.fence import Fence
-from edge.core.schema import from_mapping
+from edge.core.schema import explain
 from edge.drivers.flight_log import FlightLogError, FlightMetadata, Missing, read, read_metadata
 from edge.messages.codec import encode
 from edge.messages.codes import Reason, Refusal
@@ -305,42 +306,31 @@ class _LogReader:
             self._origins[unix_s] = _known(Origin, self._origin, "origin")
 
     def _said(self, status: Mapping[str, Any]) -> LoggedStatus:
-        for key in ("trial", "bundle_id", "world_id"):
-            if not isinstance(status[key], str):
-                raise TypeError(f"{key} = {status[key]!r}: must be text")
-        position_m = status["position_m"]
-        if position_m is not None:
-            x_m, y_m, z_m = map(float, position_m)
-            position_m = (x_m, y_m, z_m) if math.isfinite(x_m + y_m + z_m) else None
-        fence = status.get("fence")
-        if fence is not None:
-            # They are all the same, and there are very many.
-            text = json.dumps(fence)
-            if text not in self._fences:
-                self._fences[text] = _known(Fence, fence, "fence")
-            fence = self._fences[text]
-        landing_x_m, landing_y_m = map(float, status["landing_point_m"])
-        return LoggedStatus(
-            time_s=_time_s(status, "uptime_s"),
-            boot_nonce=int(status["boot_nonce"]),
-            state=FlightState(status["state"]),
-            reason=_known(Reason, status["reason"], "reason"),
-            trial=status["trial"],
-            armed=bool(status["armed"]),
-            position_m=position_m,
-            alarms=tuple(_known(Reason, alarm, "alarm") for alarm in status["alarms"]),
-            loops={
-                name: _known(LoopStatus, loop, name)
-                for name, loop in status["loops"].items()
-                if None not in [_finite(loop[key]) for key in _LATENESS]
+        position_m, fence = [*map(float, status["position_m"] or ())], status.get("fence")
+        said = _known(
+            LoggedStatus,
+            {
+                **status,
+                "time_s": _time_s(status, "uptime_s"),
+                "position_m": position_m if position_m and math.isfinite(sum(position_m)) else None,
+                "landing_point_m": [*map(float, status["landing_point_m"])],
+                "loops": {
+                    name: loop
+                    for name, loop in status["loops"].items()
+                    if None not in [_finite(loop[key]) for key in _LATENESS]
+                },
+                "fence": None,
+                "battery": _finite(status["battery"]),
             },
-            message_counts={name: int(count) for name, count in status["message_counts"].items()},
-            fence=fence,
-            battery=_finite(status["battery"]),
-            landing_point_m=(landing_x_m, landing_y_m),
-            bundle_id=status["bundle_id"],
-            world_id=status["world_id"],
+            "status",
         )
+        if fence is None:
+            return said
+        # They are all the same, and there are very many.
+        text = json.dumps(fence)
+        if text not in self._fences:
+            self._fences[text] = _known(Fence, fence, "fence")
+        return replace(said, fence=self._fences[text])
 
     def logs(self) -> Logs:
         logs = self._logs
@@ -442,11 +432,12 @@ def configured(metadata: FlightMetadata, part: str) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _known(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
+def _known(cls: type[T], value: object, where: str) -> T:
     """As `from_mapping`, but of another version's keys, which this one does not know, all go."""
-    names = {field.name for field in fields(cls)}  # type: ignore[arg-type]
-    known = {key: value for key, value in mapping.items() if key in names}
-    return from_mapping(cls, known, where)
+    try:
+        return msgspec.convert(value, cls)
+    except msgspec.ValidationError as error:
+        raise ValueError(explain(error, cls, value, where)) from None
 
 
 def _finite(value: Any) -> float | None:
