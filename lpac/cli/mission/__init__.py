@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -68,11 +68,16 @@ class OnlyNamed(Named):
     robots: Annotated[str | None, typer.Option("--robots", help="The same, such as r1,r3.")] = None
 
 
-def _named(of: Named) -> Addressed:
+def _named(of: Named, command: str) -> Addressed:
     """Resolve the robots of a command that takes their names as well as --robots."""
     if of.names and of.robots is not None:
         raise ValueError("give the robots' names or --robots, not both")
-    return address(of.fleet, ",".join(of.names) if of.names else of.robots)
+    to = address(of.fleet, ",".join(of.names) if of.names else of.robots)
+    if isinstance(of, OnlyNamed) and not to.robots:
+        raise ValueError(
+            f"{command}: name the robots, such as `lpac mission {command} r3`: it is never for all"
+        )
+    return to
 
 
 # Where
@@ -295,38 +300,30 @@ def assign(
 # Flying
 
 
-def _command_of(
-    options: type[Named],
-) -> Callable[[Callable[[Addressed], "Request"]], None]:
-    """Decorate what makes a request: adds the command of this name."""
+def _add(
+    name: str, about: str, request: Callable[[Any, tuple[str, ...]], "Request"],
+    options: type[Named] = Named,
+) -> None:  # fmt: skip
+    """Add a command that asks for one thing; `request` makes it with the module of requests."""
 
-    def add(request: Callable[[Addressed], "Request"]) -> None:
-        name = request.__name__
+    @options_of(options)
+    def command(of: Named) -> None:
+        from lpac.ground.station import protocol
 
-        @options_of(options)
-        def command(of: Named) -> None:
-            to = _named(of)
-            ask(to, request(to), name, as_json=of.as_json)
+        to = _named(of, name)
+        ask(to, request(protocol, to.robots), name, as_json=of.as_json)
 
-        app.command(name, help=request.__doc__)(command)
-
-    return add
+    app.command(name, help=about)(command)
 
 
-@_command_of(Named)
-def enable(to: Addressed) -> "Request":
-    """Let the robots run their checks, and fly."""
-    from lpac.ground.station.protocol import Enable
-
-    return Enable(True, to.robots)
-
-
-@_command_of(Named)
-def disable(to: Addressed) -> "Request":
-    """Let the robots fly no more: those in the air hold."""
-    from lpac.ground.station.protocol import Enable
-
-    return Enable(False, to.robots)
+_add(
+    "enable", "Let the robots run their checks, and fly.",
+    lambda of, robots: of.Enable(True, robots),
+)  # fmt: skip
+_add(
+    "disable", "Let the robots fly no more: those in the air hold.",
+    lambda of, robots: of.Enable(False, robots),
+)  # fmt: skip
 
 
 @app.command()
@@ -348,7 +345,7 @@ def takeoff(
     """
     from lpac.ground.station.protocol import Takeoff
 
-    to = _named(of)
+    to = _named(of, "takeoff")
     who = ", ".join(to.robots) or f"all robots of fleet {to.fleet}"
     confirm(
         f"Start the motors of {who}, and take off?",
@@ -358,28 +355,15 @@ def takeoff(
     ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=of.as_json)
 
 
-@_command_of(Named)
-def start(to: Addressed) -> "Request":
-    """Fly the mission, from hold."""
-    from lpac.ground.station.protocol import Start
-
-    return Start(to.robots)
-
-
-@_command_of(Named)
-def hold(to: Addressed) -> "Request":
-    """Stay where they are. Anybody may command it."""
-    from lpac.ground.station.protocol import SafetyCommand
-
-    return SafetyCommand("hold", to.robots)
-
-
-@_command_of(Named)
-def resume(to: Addressed) -> "Request":
-    """Withdraw hold, return or land; robots that flew the mission fly it again."""
-    from lpac.ground.station.protocol import Resume
-
-    return Resume(to.robots)
+_add("start", "Fly the mission, from hold.", lambda of, robots: of.Start(robots))
+_add(
+    "hold", "Stay where they are. Anybody may command it.",
+    lambda of, robots: of.SafetyCommand("hold", robots),
+)  # fmt: skip
+_add(
+    "resume", "Withdraw hold, return or land; robots that flew the mission fly it again.",
+    lambda of, robots: of.Resume(robots),
+)  # fmt: skip
 
 
 @app.command()
@@ -399,7 +383,7 @@ def return_(of: Named, *, wait: Wait = False) -> None:
 def _bring_down(safety_action: Literal["return", "land"], of: Named, *, wait: bool) -> None:
     from lpac.ground.station.protocol import SafetyCommand
 
-    to = _named(of)
+    to = _named(of, safety_action)
     request = SafetyCommand(safety_action, to.robots, wait)
     ask(to, request, safety_action, as_json=of.as_json)
 
@@ -407,49 +391,40 @@ def _bring_down(safety_action: Literal["return", "land"], of: Named, *, wait: bo
 # One robot at a time
 
 
-@_command_of(OnlyNamed)
-def pilot(to: Addressed) -> "Request":
-    """Hand robots to human pilots, by name: the program commands nothing until `rejoin`."""
-    return _give("pilot", to)
+_add(
+    "pilot", "Hand robots to human pilots, by name: the program commands nothing until `rejoin`.",
+    lambda of, robots: of.RobotCommand("pilot", robots), OnlyNamed,
+)  # fmt: skip
+_add(
+    "rejoin", "Take robots back from their pilots, by name: they hold; then `start`.",
+    lambda of, robots: of.RobotCommand("rejoin", robots), OnlyNamed,
+)  # fmt: skip
 
 
-@_command_of(OnlyNamed)
-def rejoin(to: Addressed) -> "Request":
-    """Take robots back from their pilots, by name: they hold; then `start`."""
-    return _give("rejoin", to)
-
-
-@_command_of(Named)
-def disarm(to: Addressed) -> "Request":
+@app.command()
+@options_of(Named)
+def disarm(of: Named) -> None:
     """Stop the motors on the ground. A robot in the air refuses."""
     from lpac.ground.station.protocol import RobotCommand
     from lpac.ground.station.subscriber import addressed
 
-    if to.robots:
-        return RobotCommand("disarm", to.robots)
-    with looking(to) as subscriber:
-        return RobotCommand("disarm", addressed(subscriber.setup, ()))
+    to = _named(of, "disarm")
+    names = to.robots
+    if not names:
+        with looking(to) as subscriber:
+            names = addressed(subscriber.setup, ())
+    ask(to, RobotCommand("disarm", names), "disarm", as_json=of.as_json)
 
 
 @app.command()
 @options_of(OnlyNamed)
 def kill(of: OnlyNamed, *, yes: Yes = False) -> None:
     """Stop the motors at once, also in the air: THE ROBOTS FALL. Asks first."""
-    to = _named(of)
-    request = _give("kill", to)
-    confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
-    ask(to, request, "kill", as_json=of.as_json)
-
-
-def _give(kind: Literal["pilot", "rejoin", "kill"], to: Addressed) -> "Request":
-    """Raises ValueError if nobody is named."""
     from lpac.ground.station.protocol import RobotCommand
 
-    if not to.robots:
-        raise ValueError(
-            f"{kind}: name the robots, such as `lpac mission {kind} r3`: it is never for all"
-        )
-    return RobotCommand(kind, to.robots)
+    to = _named(of, "kill")
+    confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
+    ask(to, RobotCommand("kill", to.robots), "kill", as_json=of.as_json)
 
 
 # Trials, and who commands
