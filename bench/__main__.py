@@ -4,8 +4,6 @@ import os
 import sys
 from importlib import import_module
 
-from rich.console import Console
-
 from bench import ROOT
 
 # One process is one robot, on one core; read by numpy when it is first imported.
@@ -28,10 +26,9 @@ def main() -> None:
     for name in names:
         if name not in BENCHES:
             sys.exit(f"bench: {name}: must be one of {', '.join(BENCHES)}")
-    console = Console(width=None if sys.stdout.isatty() else 120)
     for name in names:
         report = import_module(f"bench.{name}").measure()
-        report.show(console)
+        report.show()
         report.write(ROOT / "out" / "bench")
 
 

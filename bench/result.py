@@ -9,8 +9,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table as RichTable
+import typer
+
+from lpac.cli.printing import print_table
 
 _PACKAGES = ("numpy", "onnxruntime", "torch", "torch-geometric")
 
@@ -59,24 +60,24 @@ class Result:
             "notes": self.notes,
         }
 
-    def show(self, console: Console) -> None:
+    def show(self) -> None:
         """Print the tables, and which targets are met."""
-        for table in self.tables:
-            _print_table(console, table)
-        if self.targets:
-            rows = [
-                (
-                    target.what,
-                    f"{target.measured:.3g}",
-                    f"{'at least' if target.at_least else 'at most'} {target.limit:.3g}",
-                    "met" if target.met else "MISSED",
-                )
-                for target in self.targets
-            ]
-            columns = ("target", "measured", "wanted", "")
-            _print_table(console, Table(f"{self.name}: targets", columns, rows))
+        targets = [
+            (
+                target.what,
+                f"{target.measured:.3g}",
+                f"{'at least' if target.at_least else 'at most'} {target.limit:.3g}",
+                "met" if target.met else "MISSED",
+            )
+            for target in self.targets
+        ]
+        columns = (f"{self.name}: targets", "measured", "wanted", "")
+        for table in (*self.tables, *([Table("", columns, targets)] if targets else [])):
+            typer.echo(table.title)
+            print_table(table.columns, table.rows, table.columns[1:])
+            typer.echo()
         for note in self.notes:
-            console.print(note, markup=False, highlight=False)
+            typer.echo(note)
 
     def write(self, folder: Path) -> None:
         """Write `folder`/<name>.json."""
@@ -86,16 +87,7 @@ class Result:
 
 def progress(text: str) -> None:
     """Tell a waiting person what goes on."""
-    Console(stderr=True).print(text, style="dim", markup=False, highlight=False)
-
-
-def _print_table(console: Console, table: Table) -> None:
-    rich = RichTable(title=table.title, title_justify="left", title_style="bold")
-    for i, column in enumerate(table.columns):
-        rich.add_column(column, justify="right" if i else "left", overflow="fold")
-    for row in table.rows:
-        rich.add_row(*row)
-    console.print(rich)
+    typer.echo(text, err=True)
 
 
 def _machine() -> dict[str, Any]:

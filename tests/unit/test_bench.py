@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
@@ -16,7 +15,7 @@ from edge.policy.bundle import Bundle
 
 def kept(report: Result, folder: Path) -> dict[str, Any]:
     """The report as a reader of its file finds it, after it was shown."""
-    report.show(Console(quiet=True))
+    report.show()
     report.write(folder)
     result: dict[str, Any] = json.loads((folder / f"{report.name}.json").read_text())
     return result
