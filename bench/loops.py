@@ -17,7 +17,8 @@ from bench.result import Result, Table, Target, progress
 from bench.usage import Usage, usage
 from edge.messages.mission import LoopStatus
 from lpac.analysis.logs import LoggedStatus
-from lpac.sim.fleet.flight import fly
+from lpac.sim.engines import require_flown
+from lpac.sim.fleet.flight import FleetMoment, fly_programs
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.scenario import Scenario
 
@@ -116,10 +117,10 @@ def _fly(robots: int, mission_s: float, *, secure: bool) -> _Flight:
     looks: list[tuple[float, list[Usage]]] = []
     began_s = looked_s = -math.inf
 
-    def watch(step: str) -> None:
+    def watch(moment: FleetMoment) -> None:
         nonlocal began_s, looked_s
         now_s = time.monotonic()
-        if step != "mission":
+        if moment.step != "mission":
             return
         began_s = now_s if began_s == -math.inf else began_s
         if now_s - began_s >= _SETTLED_S and now_s - looked_s >= _LOOK_EVERY_S:
@@ -129,10 +130,9 @@ def _fly(robots: int, mission_s: float, *, secure: bool) -> _Flight:
     with tempfile.TemporaryDirectory() as folder:
         scenario = Scenario(robots=robots, seed=7, duration_s=mission_s, secure=secure)
         fleet = Fleet(scenario, Path(folder), BUNDLE)
-        flight = fly(fleet, watch=watch)
-    if flight.problem is not None:
-        raise RuntimeError(f"the flight did not go as planned: {flight.problem}")
-    statuses = [robot.last for robot in flight.robots if robot.last is not None]
+        flight = fly_programs(fleet, watch=watch)
+    require_flown(flight)
+    statuses = [each.last for each in flight.script.programs if each.last is not None]
     (first_s, first), (last_s, last) = looks[0], looks[-1]
     return _Flight(
         statuses,

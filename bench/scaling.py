@@ -16,8 +16,7 @@ from bench.timing import in_own_process
 from bench.usage import usage
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.sim.batch import BatchedFlights
-from lpac.sim.experiment import SAMPLE_S
-from lpac.sim.experiment import fly as fly_exactly
+from lpac.sim.points import SAMPLE_S, fly_points
 from lpac.sim.scenario import Scenario
 
 EXACT, BATCHED = "exact", "batched"
@@ -129,7 +128,7 @@ def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dic
 def _fly(name: str, scenario: Scenario, bundle: Bundle, note: Callable[[float], None]) -> None:
     """Fly, and note the simulated time, from 0 to the flight's end."""
     if name == EXACT:
-        fly_exactly(scenario, bundle, lambda moment: note(moment.time_s))
+        fly_points(scenario, bundle, lambda moment: note(moment.time_s))
         return
     flights = BatchedFlights([scenario], bundle)
     [prepared], [swarm] = flights.prepared, flights.swarms
@@ -137,4 +136,4 @@ def _fly(name: str, scenario: Scenario, bundle: Bundle, note: Callable[[float], 
     for [moment] in flights.moments(prepared.times_s):
         positions_m.append(moment.positions_m)
         note(moment.time_s)
-    prepared.flight(np.array(positions_m), swarm.message_counts(), swarm.largest_payload)
+    prepared.record(np.array(positions_m), swarm.message_counts(), swarm.largest_payload)

@@ -9,6 +9,7 @@ from bench import BUNDLE
 from bench.result import Result, Table, Target, progress
 from bench.timing import in_own_process
 from edge.core.logger import show
+from lpac.sim.engines import require_flown
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.scenario import Scenario
 
@@ -62,9 +63,8 @@ def _fly(robots: int, mission_s: float) -> dict[str, float]:
         scenario = Scenario(robots=robots, seed=3, duration_s=mission_s)
         flight = fly_simulated(scenario, Path(folder), BUNDLE)
         wall_s, cpu_s = perf_counter() - wall_s, process_time() - cpu_s
-    if flight.problem is not None:
-        raise RuntimeError(f"the flight did not go as planned: {flight.problem}")
-    simulated_s = flight.began_s["end"]
+    require_flown(flight)
+    simulated_s = flight.script.began_s["end"]
     return {
         "simulated_s": simulated_s,
         "wall_s": wall_s,

@@ -16,8 +16,8 @@ from bench.result import Result, Table
 from edge.policy.bundle import load_bundle
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.cores import over_cores
-from lpac.sim.experiment import fly
 from lpac.sim.fleet.clocked import fly_simulated
+from lpac.sim.points import fly_points
 from lpac.sim.usual import POINTS, USUAL_JSON, WHOLE, Usual
 
 # Seeds of their own: no picture of the documentation shows one of these flights.
@@ -71,10 +71,10 @@ def _fly(flight: _Flight) -> _Ended:
     if flight.kind == "points":
         bundle = load_bundle(SHIPPED_BUNDLE)
         points = replace(POINTS, seed=flight.seed)
-        flown = fly(points, bundle).cost[-1]
-        best = fly(replace(points, controller="clairvoyant-cvt"), bundle).cost[-1]
+        flown = fly_points(points, bundle).cost[-1]
+        best = fly_points(replace(points, controller="clairvoyant-cvt"), bundle).cost[-1]
         return _Ended(flight, float(flown / best))
     with TemporaryDirectory() as folder:
         whole = replace(WHOLE, seed=flight.seed, robots=flight.robots)
-        record = fly_simulated(whole, folder, SHIPPED_BUNDLE).record
+        record = fly_simulated(whole, folder, SHIPPED_BUNDLE)
     return _Ended(flight, float(record.true_cost[-1] / record.lloyd))

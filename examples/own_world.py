@@ -33,10 +33,10 @@ flights = {
 }
 figure, panels = plt.subplots(1, 3, figsize=(11.0, 3.2), layout="constrained")
 for axes, (name, flight) in zip(panels[:2], flights.items(), strict=True):
-    draw_snapshot(axes, flight.record, time_s=12.0)
+    draw_snapshot(axes, flight, time_s=12.0)
     axes.set_title(name)
-draw_costs(panels[2], {name: flight.record for name, flight in flights.items()})
+draw_costs(panels[2], flights)
 figure.savefig("own_world.png")
 for name, flight in flights.items():
-    print(f"{name}: {flight.normalized_cost[-1]:.3f} of the initial cost")
+    print(f"{name}: {flight.normalized[-1]:.3f} of the initial cost")
 print("see own_world.png")

@@ -22,5 +22,5 @@ def watch(moment: FlightMoment) -> None:
 
 scenario = Scenario(robots=6, seed=6, duration_s=60.0, loss=0.3)
 flight = fly(scenario, load_bundle(SHIPPED_BUNDLE), watch)
-lost, accepted = flight.messages["lost"], flight.messages["accepted"]
-print(f"ended after {flight.scenario.duration_s:g} s; {lost} messages lost, {accepted} accepted")
+lost, accepted = flight.message_counts["lost"], flight.message_counts["accepted"]
+print(f"ended after {flight.duration_s:g} s; {lost} messages lost, {accepted} accepted")

@@ -45,7 +45,7 @@ _INTERFACES = {
     "What it is trained for": {
         "lpac.train.task": "Task Teacher",
         "lpac.train.config": "DataConfig",
-        "lpac.sim.experiment": "prepare Preparation",
+        "lpac.sim.points": "prepare Preparation",
         "lpac.sim.baselines": "BaselineName",
         "lpac.study.flights": "records_of FlightGroup PlannedFlight CostCurve",
     },

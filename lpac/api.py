@@ -16,8 +16,8 @@
     lloyd = fly(Scenario(robots=10, seed=7, controller="clairvoyant-cvt"), bundle)
 
     figure, (left, right) = plt.subplots(1, 2, layout="constrained")
-    draw_snapshot(left, flight.record, time_s=10.0)
-    draw_costs(right, {"this policy": flight.record, "Lloyd": lloyd.record})
+    draw_snapshot(left, flight, time_s=10.0)
+    draw_costs(right, {"this policy": flight, "Lloyd": lloyd})
 
     study = Study(methods=(Method.of("field", SHIPPED_BUNDLE), Method.of("decentralized-cvt")))
     [[field, *baselines]] = run(study).values()     # over 20 worlds
@@ -37,7 +37,7 @@ words. What is wrong raises ValueError (`BundleError` is
 one), in one line that says what to do, or OSError for a file that is not there or cannot be used.
 
 Nothing is imported before it is used: matplotlib with what draws, the simulated whole robots with
-`fly_simulated`. The extra `sim` has all that is needed; torch never is.
+engine "simulated". The extra `sim` has all that is needed; torch never is.
 """
 
 # ruff: noqa: PLC0414 (so that who checks types sees that these names are handed on)
@@ -86,13 +86,11 @@ if TYPE_CHECKING:
     from lpac.sim.cores import in_this_process as in_this_process
     from lpac.sim.cores import over_cores as over_cores
     from lpac.sim.description import FIELD_SCALE as FIELD_SCALE
-    from lpac.sim.experiment import FlightMoment as FlightMoment
-    from lpac.sim.experiment import SimulatedFlight as SimulatedFlight
-    from lpac.sim.experiment import fly as fly
+    from lpac.sim.engines import fly as fly
     from lpac.sim.failure import Failure as Failure
     from lpac.sim.failure import LostRobots as LostRobots
-    from lpac.sim.fleet.clocked import fly_simulated as fly_simulated
-    from lpac.sim.fleet.flight import FleetFlight as FleetFlight
+    from lpac.sim.fleet.flight import FleetMoment as FleetMoment
+    from lpac.sim.points import FlightMoment as FlightMoment
     from lpac.sim.scenario import Scenario as Scenario
     from lpac.sim.ticks import Clocks as Clocks
     from lpac.sim.vehicles import PointVehicles as PointVehicles
@@ -132,10 +130,10 @@ _TAKEN = {
     "lpac.sim.batch": "fly_batch",
     "lpac.sim.cores": "in_this_process over_cores",
     "lpac.sim.description": "FIELD_SCALE",
-    "lpac.sim.experiment": "FlightMoment SimulatedFlight fly",
+    "lpac.sim.engines": "fly",
     "lpac.sim.failure": "Failure LostRobots",
-    "lpac.sim.fleet.clocked": "fly_simulated",
-    "lpac.sim.fleet.flight": "FleetFlight",
+    "lpac.sim.points": "FlightMoment",
+    "lpac.sim.fleet.flight": "FleetMoment",
     "lpac.sim.scenario": "Scenario",
     "lpac.sim.ticks": "Clocks",
     "lpac.sim.vehicles": "PointVehicles VehicleOdometry",

@@ -34,10 +34,11 @@ import numpy.typing as npt
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.perception import part_in_world, window_corner
+from edge.core.world import Feature
 from edge.messages.codes import Reason, ReasonCode
-from edge.messages.mission import FlightState
+from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState
 from lpac.analysis.coverage import Coverage
-from lpac.analysis.logs import LoggedStatus, LoopRates
+from lpac.analysis.logs import LoggedStatus, LoopRates, simulated_name
 from lpac.analysis.snapshot import FRESH_S
 from lpac.analysis.truth import TrueTrack
 
@@ -187,6 +188,90 @@ class LoopLateness:
     failures: int
 
 
+class ScriptCommand(NamedTuple):
+    """What the script commanded, in words; codes of what kept it, and of what each robot did."""
+
+    command: str
+    done: bool
+    problem: str | None
+    results: Mapping[str, str]
+
+
+class ProgramRecord(NamedTuple):
+    """What one robot's program did in a script's flight, and took.
+
+    `changes` of its state as it said itself, s from the script's start; `last` is its last status
+    in the mission, or of all. `cpu_share` is of a core.
+    """
+
+    changes: tuple[StateChange, ...]
+    last: LoggedStatus | None
+    cpu_share: float
+    peak_memory_mb: float
+    logs: tuple[str, ...]
+
+    @property
+    def restarts(self) -> int:
+        """How often it came back into its mission."""
+        return max(0, sum(c.state is FlightState.MISSION for c in self.changes) - 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ScriptRecord:
+    """How a fleet's flight by the script went; other flights have none of it.
+
+    The script started at `start_s` of the record's times. `began_s` tells when each step began, s
+    from then; the last entry, `end`, when all was over. `problem` is what kept it from its end,
+    None if nothing did. `launcher` is what the processes of the ground and of the simulated
+    vehicles took: share of a core, and MB. Vehicles and robots were so far behind real time.
+    """
+
+    vehicle: str = ""
+    start_s: float = 0.0
+    began_s: Mapping[str, float] = field(default_factory=dict)
+    problem: str | None = None
+    commands: tuple[ScriptCommand, ...] = ()
+    programs: tuple[ProgramRecord, ...] = ()
+    launcher: tuple[float, float] = (0.0, 0.0)
+    vehicles_behind_s: float = 0.0
+    robots_behind_s: float = 0.0
+    overloaded: bool = False
+
+
+class GivenOrder(NamedTuple):
+    """The operator ordered something of robots, from when it was asked for until it was answered.
+
+    `ended_s` is inf while it is not.
+    """
+
+    kind: str
+    robots: tuple[int, ...]
+    began_s: float
+    ended_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class FaultRecord:
+    """The fault of a drill's flight, and what its bounds need to know beside the vehicles' truth.
+
+    `hit` are the vehicles that it was done to, `begin_s` when it began, `marks` further times by
+    their names. `pads_m` (N, 2) is where vehicles really stood at first, `drone_m` their size.
+    `late_s` is how far the machine that flew it was behind real time; 0 on a simulated clock.
+    """
+
+    hit: tuple[int, ...] = ()
+    begin_s: float = math.nan
+    marks: Mapping[str, float] = field(default_factory=dict)
+    orders: tuple[GivenOrder, ...] = ()
+    pads_m: F64 = field(default_factory=lambda: np.zeros((0, 2)))
+    drone_m: float = math.nan
+    late_s: float = 0.0
+
+    def ordered(self, kind: str, robot: int) -> list[GivenOrder]:
+        """All orders of that kind to the robot."""
+        return [each for each in self.orders if each.kind == kind and robot in each.robots]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlightRecord:
     """One mission and its robots, from takeoff to landing; see above for what its numbers mean.
@@ -196,7 +281,9 @@ class FlightRecord:
     vehicles were, by name: also others than the mission's, and beyond what is shown. Without a
     world `coverage` is None, and the costs are empty. A robot's sensor sees `sensor_size` cells of
     the world. `clocks_known`: the robots' clocks are corrected by what a ground heard. `rates` are
-    None if logs do not tell, and of robots that have not all the same.
+    None if logs do not tell, and of robots that have not all the same. Simulators tell also the
+    id of the bundle, the world's `features`, and of points what became of messages, and the largest
+    number in one, by its absolute value.
     """
 
     name: str
@@ -216,6 +303,55 @@ class FlightRecord:
     world_ids: tuple[str, ...] = ()
     clocks_known: bool = False
     rates: LoopRates | None = None
+    bundle_id: str = ""
+    features: tuple[Feature, ...] = ()
+    message_counts: Mapping[str, int] = field(default_factory=dict)
+    largest_payload: float = 0.0
+    script: ScriptRecord = ScriptRecord()
+    fault: FaultRecord = FaultRecord()
+
+    @property
+    def time_s(self) -> F64:
+        """(T,): when points were sampled."""
+        return self.robots[0].time_s
+
+    @property
+    def positions_m(self) -> F64:
+        """(T, N, 2): where points were then. Raises ValueError for robots of times of their own."""
+        return np.stack([robot.position_m[:, :2] for robot in self.robots], axis=1)
+
+    @property
+    def flew_mission(self) -> bool:
+        """Whether there was a mission, in which somebody flew."""
+        return self.duration_s > 0.0
+
+    @property
+    def took_off(self) -> bool:
+        """Whether a robot of the script's was in the air."""
+        return any(map(self._took_off, range(len(self.script.programs))))
+
+    def _took_off(self, robot: int) -> bool:
+        track = self.truth.get(simulated_name(robot))
+        if track is not None and len(track.time_s):
+            return bool(track.airborne.any())
+        return any(change.state in AIRBORNE for change in self.script.programs[robot].changes)
+
+    @property
+    def all_landed(self) -> bool:
+        """Whether they flew, and each says that it is down and disarmed, and is, where known."""
+        return (
+            self.took_off
+            and not any(track.airborne[-1:].any() for track in self.vehicles)
+            and all(
+                program.changes and program.changes[-1].state in ON_GROUND
+                for program in self.script.programs
+            )
+        )
+
+    @property
+    def vehicles(self) -> tuple[TrueTrack, ...]:
+        """Where they were, in the order of `truth`."""
+        return tuple(self.truth.values())
 
     @cached_property
     def _counted(self) -> tuple[F64, F64]:

@@ -172,7 +172,7 @@ def _truth(logs: Logs, mission: Mission, from_s: float, to_s: float) -> dict[str
         own = [tracks[robot] for robot in mission.robots if robot in tracks]
         if any(len(t.time_s) and t.time_s[0] <= mission.begin_s <= t.time_s[-1] for t in own):
             return {
-                logs.name(robot): track.between(from_s, to_s, mission.begin_s)
+                logs.name(robot): track.between(from_s, to_s).shifted(-mission.begin_s)
                 for robot, track in tracks.items()
             }
     return {}

@@ -4,17 +4,22 @@ A simulator leaves it as truth.npz beside its robots' logs, for `lpac report`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Self
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import numpy.typing as npt
 
-from edge.core import F64
+from edge.core import F64, Bools
 
 TRUTH = "truth.npz"
 _COLUMNS = ("time_s", "position_m", "airborne")
+
+
+def _nothing() -> npt.NDArray[np.int64]:
+    return np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,11 +28,23 @@ class TrueTrack:
 
     In the clock and the frame of whoever has it. In a flight's record, and in a file, that is the
     mission frame, with heights above the ground.
+
+    The others are empty where nothing tells: `velocity_m_s` (T, 3), `mode` (T,), PX4's number of
+    it, `armed` (T,), `setpoint_at_s` (T,), when the last setpoint had come, `is_velocity` (T,),
+    whether that moved it in the plane, as in a mission, `velocity_error_m_s` (T,), how wrong its
+    estimate of the horizontal velocity was, and `commands` (T,), how many had been sent to it.
     """
 
     time_s: F64
     position_m: F64
-    airborne: npt.NDArray[np.bool_]
+    airborne: Bools
+    velocity_m_s: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+    mode: npt.NDArray[np.int64] = field(default_factory=_nothing)
+    armed: Bools = field(default_factory=lambda: np.zeros(0, np.bool_))
+    setpoint_at_s: F64 = field(default_factory=lambda: np.zeros(0))
+    is_velocity: Bools = field(default_factory=lambda: np.zeros(0, np.bool_))
+    velocity_error_m_s: F64 = field(default_factory=lambda: np.zeros(0))
+    commands: npt.NDArray[np.int64] = field(default_factory=_nothing)
 
     def positions_at(self, times_s: F64) -> F64:
         """(len(times_s), 3): NaN before the first and after the last that is known."""
@@ -44,16 +61,18 @@ class TrueTrack:
         after = np.searchsorted(self.time_s, times_s).clip(max=len(self.time_s) - 1)
         return np.where(self.airborne[after, None], self.positions_at(times_s), np.nan)
 
-    def between(self, from_s: float, to_s: float, zero_s: float) -> "TrueTrack":
-        """Cut out the part between two times; its times then count from `zero_s`."""
-        inside = (self.time_s >= from_s) & (self.time_s <= to_s)
-        return TrueTrack(
-            self.time_s[inside] - zero_s, self.position_m[inside], self.airborne[inside]
-        )
+    def is_in(self, *modes: int) -> Bools:
+        """(T,): whether it was in one of these modes of PX4."""
+        return np.isin(self.mode, modes)
 
-    def shifted(self, by_s: float) -> "TrueTrack":
+    def between(self, begin_s: float, end_s: float) -> Self:
+        """That part of it, without the end."""
+        part = slice(*np.searchsorted(self.time_s, (begin_s, end_s)).tolist())
+        return replace(self, **{each.name: getattr(self, each.name)[part] for each in fields(self)})
+
+    def shifted(self, by_s: float) -> Self:
         """The same on a clock that is `by_s` ahead."""
-        return replace(self, time_s=self.time_s + by_s)
+        return replace(self, time_s=self.time_s + by_s, setpoint_at_s=self.setpoint_at_s + by_s)
 
 
 def write_truth(tracks: Mapping[int, TrueTrack], path: Path) -> None:

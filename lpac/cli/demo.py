@@ -34,15 +34,13 @@ def demo(
         ("Lloyd, knowing the whole world", Scenario(seed=seed, controller="clairvoyant-cvt")),
     ]
     names = [name for name, _ in scenarios]
-    flights = dict(zip(names, fly_points(scenarios, DEFAULT_BUNDLE), strict=True))
-    write_demo(flights, out)
-    costs = "; ".join(
-        f"{name} {flight.normalized_cost[-1]:.3f}" for name, flight in flights.items()
-    )
+    flown = dict(zip(names, fly_points(scenarios, DEFAULT_BUNDLE), strict=True))
+    write_demo({name: (scenario, flown[name]) for name, scenario in scenarios}, out)
+    costs = "; ".join(f"{name} {record.normalized[-1]:.3f}" for name, record in flown.items())
     typer.echo(f"coverage cost after 60 s over initial cost: {costs}")
     typer.echo(f"see {out / 'demo.png'}")
-    policy, clairvoyant = (flights[name] for name in (names[0], names[-1]))
-    usual = usual_points(policy.scenario, policy.bundle_id)
+    policy, clairvoyant = flown[names[0]], flown[names[-1]]
+    usual = usual_points(scenarios[0][1], policy.bundle_id)
     typer.echo(judgement(policy.cost[-1] / clairvoyant.cost[-1], usual))
     typer.echo(
         "next: `make fly`, or `lpac sim --vehicle mavlink --out out/fly`, flies whole robots; "

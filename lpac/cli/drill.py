@@ -163,7 +163,8 @@ def _tell(outcomes: "Outcomes", folder: Path, *, as_json: bool) -> None:
 
 
 def _list(names: Sequence[str]) -> None:
-    from lpac.study.drills import INJECTIONS, faults_of, flies
+    from lpac.sim.engines import INJECTIONS, flies
+    from lpac.study.drills import faults_of
 
     print_table(
         ("fault", "what happens", "promise", "flown by"),

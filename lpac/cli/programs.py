@@ -3,9 +3,8 @@
 import shlex
 import signal
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -13,85 +12,30 @@ from lpac.cli.options import DEFAULT_ROBOTS
 
 if TYPE_CHECKING:
     from lpac.cli.live import FleetDisplay
-    from lpac.sim.fleet.flight import FleetFlight
     from lpac.sim.fleet.processes import Fleet
-    from lpac.sim.scenario import Scenario
 
 
-class ProgramsOptions(NamedTuple):
-    """What flies: `robots` are as many as were asked for, or None, as many as are carried."""
-
-    scenario: "Scenario"
-    robots: int | None
-    bundle: Path
-    vehicle: Literal["mavlink", "px4"]
-    px4_build: Path | None
-    folder: Path
-
-    def sized(self) -> "ProgramsOptions":
-        """With as many robots as this machine carries, unless their number was given.
-
-        What is wrong with a flight is said before the machine is measured.
-        """
-        if self.robots is not None:
-            return self
-        carried = as_many_as_carried(self.bundle, self.vehicle)
-        return self._replace(scenario=replace(self.scenario, robots=carried))
-
-    def fleet(self, display: "FleetDisplay") -> "Fleet":
-        """Not running yet. What is wrong with the flight itself is said before its size is."""
-        from lpac.sim.fleet.processes import Fleet
-
-        fleet = Fleet(
-            self.scenario, self.folder, self.bundle, px4_build=self.px4_build, say=display.say
-        )
-        fleet.carried = say_if_carried(self.robots, self.bundle, self.vehicle)
-        return fleet
-
-
-def fly_script(programs: ProgramsOptions) -> "FleetFlight":
-    """Fly the script: take off, cover, land."""
-    from lpac.cli.live import FleetDisplay
-    from lpac.sim.fleet.flight import fly
-
-    # Whoever stops this program means the fleet too.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with FleetDisplay(programs.scenario.robots) as display:
-        fleet = programs.fleet(display)
-        return fly(
-            fleet, display.say, lambda step: display.show_or_say(step, fleet.heard.statuses())
-        )
-
-
-def serve(programs: ProgramsOptions) -> None:
+def serve(fleet: "Fleet", display: "FleetDisplay") -> None:
     """Run the fleet for `lpac ground` until Ctrl-C, and only listen to it."""
     from edge.core.counted import counted
-    from lpac.cli.live import FleetDisplay
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        with FleetDisplay(programs.scenario.robots) as display:
-            fleet = programs.fleet(display)
-            with fleet:
-                while not fleet.heard.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
-                    fleet.require_running()
-                    fleet.vehicles.require_running()
-                    display.show_or_say("programs start", fleet.heard.statuses())
-                fleet.begin()
-                fleet_toml = programs.folder / fleet.fleet_toml.name
-                display.print(
-                    f"{counted(len(fleet.robots), 'robot')} until Ctrl-C; in a second terminal:\n\n"
-                    f"  export LPAC_FLEET={shlex.quote(str(fleet_toml))}\n"
-                    "  lpac ground\n"
-                )
-                try:
-                    _watch_over(fleet, display)
-                finally:
-                    # The robots' programs must be ended, whoever is in a hurry.
-                    for number in (signal.SIGINT, signal.SIGTERM):
-                        signal.signal(number, signal.SIG_IGN)
-    except KeyboardInterrupt:
-        typer.echo("ended")
+    with fleet:
+        while not fleet.heard.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
+            fleet.require_running()
+            fleet.vehicles.require_running()
+            display.show_or_say("programs start", fleet.heard.statuses())
+        fleet.begin()
+        display.print(
+            f"{counted(len(fleet.robots), 'robot')} until Ctrl-C; in a second terminal:\n\n"
+            f"  export LPAC_FLEET={shlex.quote(str(fleet.folder / fleet.fleet_toml.name))}\n"
+            "  lpac ground\n"
+        )
+        try:
+            _watch_over(fleet, display)
+        finally:
+            # The robots' programs must be ended, whoever is in a hurry.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
 
 
 def _watch_over(fleet: "Fleet", display: "FleetDisplay") -> None:

@@ -3,9 +3,8 @@
 import gc
 import json
 import shlex
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import signal
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -27,15 +26,15 @@ from lpac.cli.options import (
     check_px4,
 )
 from lpac.cli.printing import lines_of, progress_of
+from lpac.cli.programs import as_many_as_carried, say_if_carried, serve
 from lpac.cli.transport import WifiFile, calibration, link_line, wifi_lines
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import TaskID
 
     from edge.core.world import Feature
-    from lpac.sim.experiment import FlightMoment, SimulatedFlight
+    from lpac.analysis.flight import FlightRecord
     from lpac.sim.failure import Failure
-    from lpac.sim.fleet.flight import FleetFlight
     from lpac.sim.scenario import Scenario
 
 app = new_app()
@@ -166,12 +165,23 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
     count = _robot_count(drawn.robots, run.vehicle)
     scenario = _scenario(run, drawn, of_scenario, count)
     _require_able(scenario, run)
+    if run.out:
+        run.out.mkdir(parents=True, exist_ok=True)
     if run.vehicle is VehicleKind.POINT:
-        _fly_points(scenario, run, drawn)
+        _tell_of_features_outside(drawn.world, scenario.features, run.bundle, scenario.world_size)
+        [record] = fly_points([(scenario.controller, scenario)], run.bundle)
     elif run.vehicle is VehicleKind.SIMULATED:
-        _fly_on_clock(scenario, run)
+        record = _fly_on_clock(scenario, run)
     else:
-        _fly_programs(scenario, run, count)
+        if count is None:
+            scenario = replace(scenario, robots=as_many_as_carried(run.bundle, _programs(run)))
+        if not run.script:
+            _serve(scenario, run, count)
+            return
+        record = _fly_programs(scenario, run, count)
+    _show(scenario, record, run, drawn)
+    if record.script.vehicle and (record.script.problem or not record.all_landed):
+        raise typer.Exit(1)
 
 
 def _require_able(scenario: "Scenario", run: RunOptions) -> None:
@@ -290,131 +300,127 @@ def _robot_count(text: str | None, vehicle: VehicleKind) -> int | None:
     return count
 
 
-def _fly_points(scenario: "Scenario", run: RunOptions, drawn: FlightOptions) -> None:
-    from edge.core.counted import counted
-    from edge.policy.bundle import load_bundle
+def fly_points(scenarios: list[tuple[str, "Scenario"]], bundle: Path) -> list["FlightRecord"]:
+    """Simulate the named scenarios; how far each is goes to stderr."""
+    from edge.drivers.registry import load_policy
+    from edge.policy.family import verified
+    from lpac.sim.engines import Points, loaded_bundle
+    from lpac.sim.points import FlightMoment
 
-    if run.out:
-        run.out.mkdir(parents=True, exist_ok=True)
-    _tell_of_features_outside(drawn.world, scenario.features, run.bundle, scenario.world_size)
-    [flight] = fly_points([(scenario.controller, scenario)], run.bundle)
+    if any(scenario.controller == "lpac" for _, scenario in scenarios):
+        problem = verified(load_policy(loaded_bundle(str(bundle)))).problem
+        if problem:
+            typer.echo(f"warning: {bundle}: {problem}: no robot takes off with it", err=True)
+    gc.freeze()  # what is loaded by now stays: not to be looked through during the flight
+    records = []
+    with progress_of("s flown:") as progress:
+        for name, scenario in scenarios:
+            task = progress.add_task(name, total=scenario.duration_s)
+
+            def show(moment: FlightMoment, task: "TaskID" = task) -> None:
+                progress.update(task, completed=moment.time_s)
+
+            records += Points().fly([scenario], bundle, watch=show)
+    return records
+
+
+def _fly_on_clock(scenario: "Scenario", run: RunOptions) -> "FlightRecord":
+    from lpac.sim.engines import ClockedRobots
+
+    said = ["the fleet is made"]
+
+    def say(text: str) -> None:
+        said.append(text)
+        typer.echo(text, err=True)
+
+    with lines_of(lambda: f"{said[-1]}: still at it"):
+        [record] = ClockedRobots(say, run.recorded).fly([scenario], run.bundle, run.out)
+    return record
+
+
+def _fly_programs(scenario: "Scenario", run: RunOptions, count: int | None) -> "FlightRecord":
+    from lpac.cli.live import FleetDisplay
+    from lpac.sim.engines import Programs
+    from lpac.sim.fleet.flight import FleetMoment
+
+    def show(moment: FleetMoment) -> None:
+        display.show_or_say(moment.step, moment.statuses)
+
+    # Whoever stops this program means the fleet too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    carries = partial(say_if_carried, count, run.bundle, _programs(run))
+    with FleetDisplay(scenario.robots) as display:
+        engine = Programs(run.px4, display.say, carries)
+        [record] = engine.fly([scenario], run.bundle, run.out, show)
+    return record
+
+
+def _serve(scenario: "Scenario", run: RunOptions, count: int | None) -> None:
+    from lpac.cli.live import FleetDisplay
+    from lpac.sim.fleet.processes import Fleet
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with FleetDisplay(scenario.robots) as display:
+            out = run.out or DEFAULT_OUT
+            fleet = Fleet(scenario, out, run.bundle, px4_build=run.px4, say=display.say)
+            fleet.carried = say_if_carried(count, run.bundle, _programs(run))
+            serve(fleet, display)
+    except KeyboardInterrupt:
+        typer.echo("ended")
+
+
+def _programs(run: RunOptions) -> Literal["mavlink", "px4"]:
+    return "px4" if run.px4 else "mavlink"
+
+
+def _show(
+    scenario: "Scenario", record: "FlightRecord", run: RunOptions, drawn: FlightOptions
+) -> None:
+    from lpac.sim.summary import summary, summary_lines
+
     if run.out:
         from lpac.sim.flight_files import write_flight
 
-        write_flight(flight, run.out)
+        write_flight(scenario, record, run.out)
     if run.as_json:
-        typer.echo(json.dumps(flight.summary(), indent=2))
+        typer.echo(json.dumps(summary(scenario, record), indent=2))
         return
+    if record.script.vehicle:
+        typer.echo("\n".join(summary_lines(scenario, record)))
+    else:
+        _show_points(scenario, record, run.bundle, drawn)
+    if not run.out:
+        return
+    logged = any(program.logs for program in record.script.programs)
+    logs = f"; the flight logs are in {run.out / 'robots'}" if logged else ""
+    typer.echo(f"see {run.out / 'flight.png'}{logs}")
+    if logged:
+        typer.echo(
+            f"next: `lpac report {shlex.quote(str(run.out))}` makes all figures and a page; "
+            "with `lpac sim --vehicle mavlink --no-script` you command (docs/ground.md)"
+        )
+
+
+def _show_points(
+    scenario: "Scenario", record: "FlightRecord", bundle: Path, drawn: FlightOptions
+) -> None:
+    from edge.core.counted import counted
+    from lpac.sim.engines import loaded_bundle
+
     is_policy = scenario.controller == "lpac"
-    flier = load_bundle(run.bundle).manifest.name if is_policy else scenario.controller
-    typer.echo(
-        f"{flier}, {counted(scenario.robots, 'robot')}, seed {scenario.seed}: {_result(flight)}"
-    )
+    flier = loaded_bundle(str(bundle)).manifest.name if is_policy else scenario.controller
+    result = "what there is lies outside of the world, so that there was nothing to cover"
+    if len(record.normalized):
+        result = (
+            f"after {record.duration_s:g} s the coverage cost is {record.normalized[-1]:.3f} of "
+            "the initial cost"
+        )
+    typer.echo(f"{flier}, {counted(scenario.robots, 'robot')}, seed {scenario.seed}: {result}")
     if scenario.radio is not None:
         found = calibration(drawn.wifi, transport=True)
         typer.echo(f"{scenario.radio.transport}: {link_line(*scenario.link)}; it assumes")
         typer.echo("\n".join(wifi_lines(found)))
-    if run.out:
-        typer.echo(f"see {run.out / 'flight.png'}")
-
-
-def _fly_on_clock(scenario: "Scenario", run: RunOptions) -> None:
-    """Fly whole robots on one simulated clock; exit code 1 unless it ended as it should."""
-    from lpac.sim.fleet.clocked import fly_simulated
-
-    with _folder(run.out) as folder:
-        said = ["the fleet is made"]
-
-        def say(text: str) -> None:
-            said.append(text)
-            typer.echo(text, err=True)
-
-        with lines_of(lambda: f"{said[-1]}: still at it"):
-            flight = fly_simulated(
-                scenario, folder, run.bundle, say, logs=run.out is not None, recorded=run.recorded
-            )
-    _show_fleet_flight(flight, run)
-
-
-def _fly_programs(scenario: "Scenario", run: RunOptions, count: int | None) -> None:
-    """Fly a fleet of processes; exit code 1 if its flight did not end as it should."""
-    from lpac.cli.programs import ProgramsOptions, fly_script, serve
-
-    with _folder(run.out if run.script else run.out or DEFAULT_OUT) as folder:
-        vehicle: Literal["mavlink", "px4"] = "px4" if run.px4 else "mavlink"
-        programs = ProgramsOptions(scenario, count, run.bundle, vehicle, run.px4, folder).sized()
-        if not run.script:
-            serve(programs)
-            return
-        flight = fly_script(programs)
-    _show_fleet_flight(flight, run)
-
-
-@contextmanager
-def _folder(out: Path | None) -> Iterator[Path]:
-    """One that is gone afterwards if none is given."""
-    if out is not None:
-        yield out
-        return
-    with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere:
-        yield Path(nowhere)
-
-
-def _show_fleet_flight(flight: "FleetFlight", run: RunOptions) -> None:
-    from lpac.sim.fleet.flight import summary_lines
-
-    out = run.out
-
-    if out:
-        from lpac.sim.flight_files import write_fleet_flight
-
-        write_fleet_flight(flight, out)
-    if run.as_json:
-        typer.echo(json.dumps(flight.summary(), indent=2))
-    else:
-        for line in summary_lines(flight):
-            typer.echo(line)
-        if out:
-            logged = any(robot.logs for robot in flight.robots)
-            logs = f"; the flight logs are in {out / 'robots'}" if logged else ""
-            typer.echo(f"see {out / 'flight.png'}{logs}")
-            if logged:
-                typer.echo(
-                    f"next: `lpac report {shlex.quote(str(out))}` makes all figures and a page; "
-                    "with `lpac sim --vehicle mavlink --no-script` you command (docs/ground.md)"
-                )
-    if flight.problem or not flight.all_landed:
-        raise typer.Exit(1)
-
-
-def fly_points(
-    scenarios: list[tuple[str, "Scenario"]], bundle_path: Path
-) -> list["SimulatedFlight"]:
-    """Simulate the named scenarios; how far each is goes to stderr."""
-    from edge.drivers.registry import load_policy
-    from edge.policy.bundle import load_bundle
-    from edge.policy.family import verified
-    from lpac.sim.experiment import fly
-
-    bundle = load_bundle(bundle_path)
-    if any(scenario.controller == "lpac" for _, scenario in scenarios):
-        problem = verified(load_policy(bundle)).problem
-        if problem:
-            typer.echo(f"warning: {bundle_path}: {problem}: no robot takes off with it", err=True)
-    gc.freeze()  # what is loaded by now stays: not to be looked through during the flight
-    flights = []
-    with progress_of("s flown:") as progress:
-        for name, scenario in scenarios:
-            task = progress.add_task(name, total=scenario.duration_s)
-            flights.append(fly(scenario, bundle, partial(_show, progress, task)))
-    return flights
-
-
-def _result(flight: "SimulatedFlight") -> str:
-    if not flight.importance.any():
-        return "what there is lies outside of the world, so that there was nothing to cover"
-    duration_s, cost = flight.scenario.duration_s, flight.normalized_cost[-1]
-    return f"after {duration_s:g} s the coverage cost is {cost:.3f} of the initial cost"
 
 
 def require_something_to_cover(
@@ -489,7 +495,3 @@ def _text(path: Path) -> str:
         return path.read_text("utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"{path}: is not a text file") from None
-
-
-def _show(progress: "Progress", task: "TaskID", moment: "FlightMoment") -> None:
-    progress.update(task, completed=moment.time_s)

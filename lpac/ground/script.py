@@ -324,6 +324,8 @@ class ScriptError(RuntimeError):
 class ScriptRun:
     """One run of a script. `robots` are those that it addresses, `given` whom a pilot has by it.
 
+    `mission_ends` may be set: the mission is over then, and the next step comes.
+
     `fly` and `hold` are procedures: whoever has the ground carries them out.
     """
 
@@ -345,6 +347,7 @@ class ScriptRun:
         self._ground = ground
         self._listener = listener
         self.given: set[str] = set()
+        self.mission_ends = False
         self._said: set[Hashable] = set()
         self._last_start_s: dict[str, float] = {}
 
@@ -520,6 +523,8 @@ class ScriptRun:
         before = dict.fromkeys(self.robots, _S.MISSION)
         left_alone: set[str] = set()
         while (left_s := began_s + step.duration_s - self._ground.now_s) > 0.0:
+            if self.mission_ends:
+                return
             while due and self._ground.now_s - began_s >= due[0].at_s:
                 yield from self._perturb(due.pop(0))
             free_s = min([left_s, *(began_s + p.at_s - self._ground.now_s for p in due)])

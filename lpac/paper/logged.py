@@ -14,7 +14,7 @@ from lpac.analysis.flight import FlightRecord
 from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Pool
 from lpac.sim.description import FIELD_SCALE
-from lpac.sim.experiment import cost_times_s
+from lpac.sim.points import cost_times_s
 from lpac.sim.scenario import Scenario
 from lpac.study.flights import CLAIRVOYANT, PlannedFlight, fly_all, records_of, sizes_of
 from lpac.study.hearing_robot import message_bytes

@@ -1,26 +1,39 @@
 """The engines: each flies scenarios, and what comes of a flight is its record."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import cache
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
-from edge.policy.bundle import Bundle, load_bundle
+from edge.policy.bundle import Bundle, load_bundle, write_bundle
 from lpac.analysis.flight import FlightRecord
 from lpac.sim.batch import PolicyFailedError, fly_batch
-from lpac.sim.experiment import fly, require_points
+from lpac.sim.drill.faults import FAULTS, Fault
+from lpac.sim.drill.field import settings_of, supports
+from lpac.sim.drill.processes import MAVLINK, PX4, fly_fault
+from lpac.sim.drill.simulated import SUPPORTED, SimulatedDrill
 from lpac.sim.fleet.clocked import fly_simulated
-from lpac.sim.fleet.flight import FleetFlight
-from lpac.sim.fleet.flight import fly as fly_fleet
+from lpac.sim.fleet.flight import fly_programs
 from lpac.sim.fleet.layout import require_whole_robots
+from lpac.sim.fleet.listener import Say
 from lpac.sim.fleet.processes import Fleet
+from lpac.sim.points import fly_points, require_points
 from lpac.sim.scenario import Scenario
 
 EngineName = Literal["point", "simulated", "mavlink", "px4"]
+# What the drill does to a fleet, by engine.
+INJECTIONS: dict[EngineName, tuple[type, ...]] = {
+    "point": (), "simulated": SUPPORTED, "mavlink": MAVLINK, "px4": PX4,
+}  # fmt: skip
 # Flights of these go one after another, with nothing beside them.
 IN_REAL_TIME: tuple[EngineName, ...] = ("mavlink", "px4")
+
+
+# Called with a `FlightMoment` of points, or a `FleetMoment`: both have `time_s`, `step`, `stop`.
+Watch = Callable[[Any], object]
 
 
 class Engine(Protocol):
@@ -35,19 +48,26 @@ class Engine(Protocol):
         """Raise ValueError that names what this engine cannot do."""
 
     def fly(
-        self, scenarios: Sequence[Scenario], bundle: Path, folder: Path | None = None
+        self,
+        scenarios: Sequence[Scenario],
+        bundle: Bundle | Path,
+        folder: Path | None = None,
+        watch: Watch | None = None,
     ) -> list[FlightRecord]:
         """The record of each, in their order; whole robots' logs stay in `folder`, if there is one.
 
-        Raises BundleError; ValueError for what it cannot do, and for a flight that came to nothing;
-        OSError, and in real time FleetError, LinkError, GroundError or VehicleError.
+        `watch` is called several times a second, and may stop the flight. A fleet's `script` says
+        in its record what kept it from its end.
+
+        Raises BundleError; ValueError for what it cannot do, and for points that were stopped at
+        their start; OSError, and in real time FleetError, LinkError, GroundError or VehicleError.
         """
 
 
 class Points:
     """Points that fly what the robots' loops decide, or a baseline.
 
-    Several flights of a policy go together, in batches, and come out the same.
+    Several flights of a policy that nobody watches go together, in batches, and come out the same.
     """
 
     whole_robots = False
@@ -57,87 +77,171 @@ class Points:
         require_points(scenario)
 
     def fly(
-        self, scenarios: Sequence[Scenario], bundle: Path, folder: Path | None = None
+        self,
+        scenarios: Sequence[Scenario],
+        bundle: Bundle | Path,
+        folder: Path | None = None,
+        watch: Watch | None = None,
     ) -> list[FlightRecord]:
         """See `Engine`."""
-        loaded = loaded_bundle(str(bundle))
-        if any(scenario.controller != "lpac" for scenario in scenarios):
-            return [fly(scenario, loaded).record for scenario in scenarios]
+        loaded = bundle if isinstance(bundle, Bundle) else loaded_bundle(str(bundle))
+        if watch is not None or any(scenario.controller != "lpac" for scenario in scenarios):
+            return [fly_points(scenario, loaded, watch) for scenario in scenarios]
         try:
-            return [flown.record for flown in fly_batch(scenarios, loaded)]
+            return fly_batch(scenarios, loaded)
         except PolicyFailedError as error:
-            raise ValueError(f"{bundle}: {error}") from None
+            raise ValueError(f"{loaded.manifest.name}: {error}") from None
 
 
-class ClockedRobots:
-    """Whole robots on simulated vehicles and one simulated clock, all in this process."""
+class _WholeRobots(ABC):
+    """Fleets, one after another."""
 
     whole_robots = True
 
-    def require_able(self, scenario: Scenario) -> None:
-        """See `Engine`."""
-        require_whole_robots(scenario)
-
     def fly(
-        self, scenarios: Sequence[Scenario], bundle: Path, folder: Path | None = None
+        self,
+        scenarios: Sequence[Scenario],
+        bundle: Bundle | Path,
+        folder: Path | None = None,
+        watch: Watch | None = None,
     ) -> list[FlightRecord]:
         """See `Engine`."""
         records = []
         for scenario in scenarios:
-            with _folder_or_none(folder) as kept:
-                flown = fly_simulated(scenario, kept, bundle, logs=folder is not None)
-                records.append(_record(flown))
+            with TemporaryDirectory(prefix="lpac-sim-") as nowhere:
+                path = Path(nowhere) / "bundle" if isinstance(bundle, Bundle) else bundle
+                if isinstance(bundle, Bundle):
+                    write_bundle(bundle, path)
+                flown_in = folder or Path(nowhere) / "flight"
+                records.append(self._fly(scenario, path, flown_in, watch, logs=bool(folder)))
         return records
 
+    @abstractmethod
+    def _fly(
+        self, scenario: Scenario, bundle: Path, folder: Path, watch: Watch | None, *, logs: bool
+    ) -> FlightRecord: ...
 
-class Programs:
-    """A program for each robot, in real time, on simulated vehicles or on PX4s of a build."""
 
-    whole_robots = True
+@dataclass(frozen=True, slots=True)
+class ClockedRobots(_WholeRobots):
+    """Whole robots on simulated vehicles and one simulated clock, all in this process.
 
-    def __init__(self, px4_build: Path | None) -> None:
-        self._px4_build = px4_build
+    `recorded` is the folder of an earlier flight, whose policies' steps are taken again.
+    """
+
+    say: Say = lambda _: None
+    recorded: Path | None = None
+
+    def require_able(self, scenario: Scenario) -> None:
+        """See `Engine`."""
+        require_whole_robots(scenario)
+        _require_fault("simulated", scenario)
+
+    def _fly(
+        self, scenario: Scenario, bundle: Path, folder: Path, watch: Watch | None, *, logs: bool
+    ) -> FlightRecord:
+        if scenario.fault:
+            return drill_of(str(bundle)).fly(scenario, folder if logs else None)
+        return fly_simulated(
+            scenario, folder, bundle, self.say, watch, logs=logs, recorded=self.recorded
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Programs(_WholeRobots):
+    """A program for each robot, in real time, on simulated vehicles or on PX4s of a build.
+
+    `carries` is asked, once the fleet is described, how many of them this machine carries; None if
+    nobody looks.
+    """
+
+    px4_build: Path | None = None
+    say: Say = lambda _: None
+    carries: Callable[[], int | None] = lambda: None
 
     def require_able(self, scenario: Scenario) -> None:
         """See `Engine`."""
         scenario.require_default("programs in real time", "loss", "delay_s")
         require_whole_robots(scenario)
+        _require_fault("px4" if self.px4_build else "mavlink", scenario)
 
-    def fly(
-        self, scenarios: Sequence[Scenario], bundle: Path, folder: Path | None = None
-    ) -> list[FlightRecord]:
-        """See `Engine`."""
-        records = []
-        for scenario in scenarios:
-            with _folder_or_none(folder) as kept:
-                fleet = Fleet(scenario, kept, bundle, px4_build=self._px4_build)
-                records.append(_record(fly_fleet(fleet)))
-        return records
+    def _fly(
+        self, scenario: Scenario, bundle: Path, folder: Path, watch: Watch | None, *, logs: bool
+    ) -> FlightRecord:
+        fault = FAULTS.get(scenario.fault)
+        settings = settings_of(fault) if fault else {}
+        fleet = Fleet(
+            scenario, folder, bundle, px4_build=self.px4_build, settings=settings, say=self.say
+        )
+        if fault:
+            return fly_fault(fleet, fault)
+        fleet.carried = self.carries()
+        return fly_programs(fleet, self.say, watch or (lambda _: None))
 
 
-def engine_of(name: EngineName, px4_build: Path | None = None) -> Engine:
-    """The engine of that name; PX4s alone need their build. Raises ValueError."""
+def engine_of(name: EngineName, px4_build: Path | None = None, say: Say = lambda _: None) -> Engine:
+    """The engine of that name; PX4s alone need their build, `say` is told how a fleet goes on.
+
+    Raises ValueError.
+    """
     if name == "px4" and px4_build is None:
         raise ValueError("px4: needs PX4's build folder")
     if name == "point":
         return Points()
-    return ClockedRobots() if name == "simulated" else Programs(px4_build)
+    return ClockedRobots(say) if name == "simulated" else Programs(px4_build, say)
 
 
-@contextmanager
-def _folder_or_none(folder: Path | None) -> Iterator[Path]:
-    """One that is gone afterwards if none is given."""
-    if folder is not None:
-        yield folder
-        return
-    with TemporaryDirectory() as temporary:
-        yield Path(temporary)
+def flies(engine: EngineName, fault: Fault) -> bool:
+    """Whether all that a fault does can be done to the vehicles of an engine."""
+    return supports(INJECTIONS[engine], fault)
 
 
-def _record(flown: FleetFlight) -> FlightRecord:
-    if flown.problem is not None or not len(flown.record.curve_time_s):
-        raise ValueError(f"the flight came to nothing: {flown.problem or 'nobody flew'}")
-    return flown.record
+def _require_fault(engine: EngineName, scenario: Scenario) -> None:
+    name = scenario.fault
+    if name and name not in FAULTS:
+        raise ValueError(f"fault = {name}: there is none; `lpac drill --list` has all")
+    if name and not flies(engine, FAULTS[name]):
+        raise ValueError(
+            f"fault = {name}: is not flown with {engine}; `lpac drill --list` tells what is"
+        )
+
+
+def fly(
+    scenario: Scenario,
+    bundle: Bundle | Path,
+    watch: Watch | None = None,
+    *,
+    engine: EngineName = "point",
+    folder: Path | None = None,
+    px4_build: Path | None = None,
+    say: Say = lambda _: None,
+) -> FlightRecord:
+    """Fly one scenario on the engine of that name; `bundle` flies, or sizes a baseline's maps.
+
+    `folder` keeps what whole robots log. Raises what `engine_of` and `Engine.fly` do.
+    """
+    chosen = engine_of(engine, px4_build, say)
+    chosen.require_able(scenario)
+    # Another bundle may be at that path by now.
+    drill_of.cache_clear()
+    loaded = load_bundle(bundle) if engine == "point" and isinstance(bundle, Path) else bundle
+    # In batches a policy that fails ends them; without, it is seen what its robots do.
+    [record] = chosen.fly([scenario], loaded, folder, watch or (lambda _: None))
+    return record
+
+
+def require_flown(record: FlightRecord) -> None:
+    """Raise ValueError for a flight that came to nothing."""
+    problem = record.script.problem
+    if problem is not None or not len(record.curve_time_s):
+        raise ValueError(f"the flight came to nothing: {problem or 'nobody flew'}")
+
+
+# Kept, so that flights share their begin.
+@lru_cache(maxsize=1)
+def drill_of(bundle: str) -> SimulatedDrill:
+    """The drill with the bundle at a path."""
+    return SimulatedDrill(Path(bundle))
 
 
 @cache

@@ -40,7 +40,8 @@ class UnableError(ValueError):
 
     def __init__(self, engine: str, name: str, value: object, default: object) -> None:
         super().__init__(
-            f"{name} = {value}: must be {default} for {engine}, which know nothing of it"
+            f"{name} = {value}: must be {default or repr(default)} for {engine}, which know "
+            "nothing of it"
         )
         self.name = name
 
@@ -65,7 +66,8 @@ class Scenario(Bounded):
     and in model units, how wrong its position is, to which the error of `position_error_m` is
     added; with a `radio` its model says what is lost and late.
 
-    Whole robots alone: `budget` is the error that they allow for.
+    Whole robots alone: `budget` is the error that they allow for. With a `fault` of the drill that
+    says how long the flight lasts.
 
     Raises ValueError that names what is impossible.
     """
@@ -129,6 +131,7 @@ class Scenario(Bounded):
         "what they say is signed, and nobody else is heard.",
     ] = False
     transport: Transport = "mesh"
+    fault: Annotated[str, "Whole robots: what the drill does to the fleet."] = ""
 
     def check_rules(self) -> None:
         """See `Bounded`."""

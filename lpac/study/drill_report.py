@@ -37,7 +37,7 @@ def summaries(outcomes: Outcomes) -> list[FaultSummary]:
     """By fault, in the catalogue's order."""
     by_fault: dict[str, list[FlightOutcome]] = {}
     for flight, outcome in outcomes.items():
-        by_fault.setdefault(flight.fault, []).append(outcome)
+        by_fault.setdefault(flight.scenario.fault, []).append(outcome)
     return [
         FaultSummary(name, len(flown), sum(not outcome.held for outcome in flown), _worst(flown))
         for name in FAULTS
@@ -53,7 +53,7 @@ def _worst(outcomes: Iterable[FlightOutcome]) -> tuple[Figure, ...]:
 def flown_again_by(flight: PlannedFlight) -> str:
     """The command that flies exactly that flight again."""
     scenario = flight.scenario
-    words = ["lpac", "drill", "--fault", flight.fault, "--seed", str(scenario.seed)]
+    words = ["lpac", "drill", "--fault", flight.scenario.fault, "--seed", str(scenario.seed)]
     words += ["-n", str(scenario.robots)]
     if flight.bundle != str(SHIPPED_BUNDLE.resolve()):
         words += ["--bundle", flight.bundle]
@@ -84,7 +84,7 @@ def report_of(outcomes: Outcomes, made_by: Mapping[str, str]) -> Report:
         f"at most {share:.3g} % do, in this model"
     ]
     for flight, outcome in broken.items():
-        note += [f"{flight.fault}, seed {flight.scenario.seed}: {_why(outcome)}"]
+        note += [f"{flight.scenario.fault}, seed {flight.scenario.seed}: {_why(outcome)}"]
         note += [f"    {flown_again_by(flight)}"]
     first = next(iter(outcomes))
     late_s = max(outcome.late_s for outcome in outcomes.values())
@@ -138,7 +138,7 @@ def _told(outcomes: Outcomes) -> dict[str, Any]:
         ],
         "broken": [
             {
-                "fault": flight.fault,
+                "fault": flight.scenario.fault,
                 "seed": flight.scenario.seed,
                 "error": outcome.error,
                 "late_s": round(outcome.late_s, 2),
@@ -161,7 +161,7 @@ def _rows(outcomes: Outcomes) -> Iterable[Sequence[object]]:
     yield "fault", "seed", *Figure._fields, "broken"
     for flight, outcome in outcomes.items():
         for figure in outcome.figures:
-            yield flight.fault, flight.scenario.seed, *figure, figure.broken
+            yield flight.scenario.fault, flight.scenario.seed, *figure, figure.broken
 
 
 def as_junit(outcomes: Outcomes) -> bytes:
@@ -172,10 +172,12 @@ def as_junit(outcomes: Outcomes) -> bytes:
     )
     for flight, outcome in outcomes.items():
         case = ElementTree.SubElement(
-            suite, "testcase", classname=flight.fault, name=f"seed {flight.scenario.seed}"
+            suite, "testcase", classname=flight.scenario.fault, name=f"seed {flight.scenario.seed}"
         )
         if not outcome.held:
             failure = ElementTree.SubElement(case, "failure", message=_why(outcome))
-            failure.text = f"promised: {FAULTS[flight.fault].promise}\n{flown_again_by(flight)}"
+            failure.text = (
+                f"promised: {FAULTS[flight.scenario.fault].promise}\n{flown_again_by(flight)}"
+            )
     xml: bytes = ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True)
     return xml

@@ -5,7 +5,7 @@ import signal
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,23 +15,19 @@ from edge.core.logger import show
 from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, from_mapping
 from edge.drivers.registry import open_sensor
 from edge.policy.bundle import load_bundle
+from lpac.analysis.flight import FlightRecord
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.cores import Pool, in_this_process, over_processes
 from lpac.sim.drill.faults import FAULTS, Fault
-from lpac.sim.drill.field import scenario_of, supports
+from lpac.sim.drill.field import scenario_of
 from lpac.sim.drill.outcome import FlightOutcome, outcome_of
-from lpac.sim.drill.processes import MAVLINK, PX4
-from lpac.sim.drill.simulated import SUPPORTED, SimulatedDrill
+from lpac.sim.engines import flies
 from lpac.sim.scenario import WORLD_SENSOR
 from lpac.sim.sitl.build import require_build
 from lpac.study.file import read_toml
 from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight, require_planned
 
 DrillEngine = Literal["simulated", "mavlink", "px4"]
-# What is done to a fleet by each.
-INJECTIONS: dict[DrillEngine, tuple[type, ...]] = {
-    "simulated": SUPPORTED, "mavlink": MAVLINK, "px4": PX4,
-}  # fmt: skip
 # A robot with its vehicle and its part of a ground takes 0.12 of a core, averaged over a flight.
 _CORES_EACH = 0.16
 
@@ -81,7 +77,6 @@ class Drill(Bounded):
                 flown_by=bundle.id,
                 engine=self.engine,
                 px4_build=px4,
-                fault=fault.name,
             )
             for seed in range(self.first_seed, self.first_seed + self.seeds)
             for fault in faults
@@ -103,11 +98,6 @@ def faults_of(names: Sequence[str], engine: DrillEngine, where: str = "") -> lis
             f"{where} {others}: is not flown with {engine}; `lpac drill --list` tells what is"
         )
     return flown
-
-
-def flies(engine: DrillEngine, fault: Fault) -> bool:
-    """Whether all that a fault does can be done to the vehicles of an engine."""
-    return supports(INJECTIONS[engine], fault)
 
 
 def read_drill(path: Path) -> Drill:
@@ -148,7 +138,9 @@ def fly_drill(
             broken += not outcome.held
             tell(len(outcomes), len(flights), f"{broken} broke a promise" if broken else "")
     places = {name: place for place, name in enumerate(FAULTS)}
-    in_order = sorted(flights, key=lambda flight: (places[flight.fault], flight.scenario.seed))
+    in_order = sorted(
+        flights, key=lambda flight: (places[flight.scenario.fault], flight.scenario.seed)
+    )
     return {flight: outcomes[flight] for flight in in_order}
 
 
@@ -161,29 +153,26 @@ def outcomes_of(
     """
     [flight] = group
     require_planned(flight)
-    fault, scenario, bundle = FAULTS[flight.fault], flight.scenario, Path(flight.bundle)
+    fault, engine = FAULTS[flight.scenario.fault], flight.flown_on()
+    logs = logs_of(flight, folder) if folder else None
+
+    def flown() -> FlightRecord:
+        [record] = engine.fly([flight.scenario], Path(flight.bundle), logs)
+        return record
+
     # Thousands of flights say more than anybody reads.
     show("error")
-    if folder is None:
-        outcome = outcome_of(fault, lambda: _drill(bundle).fly(fault, scenario))
-        return [(flight, outcome)]
+    if logs is None:
+        return [(flight, outcome_of(fault, flown))]
     # Whoever keeps nothing draws nothing.
     from lpac.sim.drill.logged import fly_logged  # noqa: PLC0415
 
-    outcome = fly_logged(
-        fault, scenario, bundle, logs_of(flight, folder),
-        Path(flight.px4_build) if flight.px4_build else None,
-        in_real_time=flight.engine != "simulated",
-    )  # fmt: skip
-    return [(flight, outcome)]
+    return [(flight, fly_logged(fault, flown, logs))]
 
 
 def logs_of(flight: PlannedFlight, folder: Path) -> Path:
     """Where a flight leaves its logs."""
-    return folder / f"{flight.fault}-{flight.scenario.seed}"
-
-
-_drill = cache(SimulatedDrill)
+    return folder / f"{flight.scenario.fault}-{flight.scenario.seed}"
 
 
 def _in_worker(group: FlightGroup, folder: Path) -> list[tuple[PlannedFlight, FlightOutcome]]:

@@ -18,9 +18,16 @@ from edge.policy.bundle import Bundle, BundleError
 from lpac.analysis.flight import FlightRecord
 from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Outcome, Pool, in_this_process
-from lpac.sim.engines import IN_REAL_TIME, EngineName, engine_of, loaded_bundle
-from lpac.sim.experiment import cost_times_s
+from lpac.sim.engines import (
+    IN_REAL_TIME,
+    Engine,
+    EngineName,
+    engine_of,
+    loaded_bundle,
+    require_flown,
+)
 from lpac.sim.kept import KeptOutcomes, code_digest
+from lpac.sim.points import cost_times_s
 from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import build_digest
 
@@ -36,8 +43,7 @@ class PlannedFlight:
     """A scenario, the engine that flies it, and the bundle.
 
     `bundle` is the path of the one that flies, or that gives a baseline the sizes of sensor and
-    local map; `flown_by` is its id, or says these sizes. PX4s are those of `px4_build`. `fault` is
-    what the drill does to the fleet.
+    local map; `flown_by` is its id, or says these sizes. PX4s are those of `px4_build`.
     """
 
     scenario: Scenario
@@ -45,13 +51,16 @@ class PlannedFlight:
     flown_by: str
     engine: EngineName = "point"
     px4_build: str = ""
-    fault: str = ""
+
+    def flown_on(self) -> Engine:
+        """The engine itself. Raises ValueError for PX4s without their build."""
+        return engine_of(self.engine, Path(self.px4_build) if self.px4_build else None)
 
     @property
     def key(self) -> str:
         """What tells it from all other flights, wherever the bundle and PX4 lie."""
         px4 = _px4_digest(self.px4_build) if self.engine == "px4" and self.px4_build else ""
-        told = repr((self.engine, self.flown_by, px4, self.fault, self.scenario))
+        told = repr((self.engine, self.flown_by, px4, self.scenario))
         return hashlib.sha256(told.encode()).hexdigest()
 
 
@@ -130,9 +139,10 @@ def records_of(
     first = group[0]
     if first.scenario.controller == POLICY:
         require_planned(first)
-    engine = engine_of(first.engine, Path(first.px4_build) if first.px4_build else None)
     kept = logs / f"flight-{first.key[:8]}" if logs and first.engine in IN_REAL_TIME else None
-    flown = engine.fly([flight.scenario for flight in group], Path(first.bundle), kept)
+    flown = first.flown_on().fly([flight.scenario for flight in group], Path(first.bundle), kept)
+    for record in flown:
+        require_flown(record)
     return list(zip(group, flown, strict=True))
 
 
@@ -197,7 +207,7 @@ class KeptFlights(Generic[Outcome]):
         """What came of one more. Raises OSError."""
         if self._is_kept(outcome) and flight.key not in self._outcomes:
             self._outcomes[flight.key] = outcome
-            told = {"flight": flight.key, "fault": flight.fault}
+            told = {"flight": flight.key, "fault": flight.scenario.fault}
             self._kept.add({**told, "seed": flight.scenario.seed, "outcome": outcome})
 
     def fly(

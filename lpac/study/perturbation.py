@@ -9,7 +9,7 @@ import numpy as np
 from edge.core import F64
 from edge.messages.mission import FlightState
 from lpac.analysis.flight import FlightRecord
-from lpac.sim.experiment import SAMPLE_S
+from lpac.sim.points import SAMPLE_S
 from lpac.sim.scenario import Scenario
 
 # Settled is what stays within so much of what it comes to in the end.

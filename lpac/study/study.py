@@ -214,6 +214,11 @@ class Study(Bounded):
         for condition in self.conditions:
             engine = self.engine_of(condition)
             engine.require_able(condition.scenario)
+            if condition.scenario.fault:
+                raise ValueError(
+                    f"fault = {condition.scenario.fault}: no cost is judged under a fault; a drill "
+                    "flies it"
+                )
             if engine.whole_robots and (condition.lost.robots or condition.from_pads):
                 raise ValueError("lost, from_pads: are of points alone")
             for name in condition.methods:

@@ -69,7 +69,8 @@ class SetUp:
     @classmethod
     def of(cls, scenario: Scenario) -> "SetUp":
         """That of a scenario whose sizes are known. Raises ValueError that names what is not."""
-        assert scenario.world_size is not None and scenario.communication_range is not None
+        if scenario.world_size is None or scenario.communication_range is None:
+            raise ValueError("world_size, communication_range: must be given")
         return cls(
             robots=scenario.robots,
             world_size=scenario.world_size,

@@ -16,7 +16,7 @@ from edge.core import F32, F64, Bools
 from edge.core.coverage import cvt_velocity, voronoi_cells
 from edge.core.perception import PerceptionParameters, window_corner
 from lpac.analysis.coverage import coarse, lloyd_ends
-from lpac.sim.experiment import Preparation
+from lpac.sim.points import Preparation
 from lpac.train.config import DataConfig
 
 Indices = npt.NDArray[np.intp]

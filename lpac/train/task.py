@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 
 from edge.core import F64, Bools
 from lpac.sim.baselines import BaselineName
-from lpac.sim.experiment import Preparation
+from lpac.sim.points import Preparation
 from lpac.study.flights import CostCurve, FlightGroup, PlannedFlight, curves_of
 from lpac.train.config import DataConfig
 from lpac.train.expert import Expert, make_expert

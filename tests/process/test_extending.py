@@ -23,7 +23,7 @@ import json
 from pathlib import Path
 from edge.policy.bundle import load_bundle
 from lpac.sim.batch import fly_batch
-from lpac.sim.experiment import fly
+from lpac.sim.points import fly_points
 from lpac.sim.scenario import Scenario
 from lpac.sim.failure import Failure
 
@@ -34,7 +34,8 @@ scenarios = [
     Scenario(robots=2, duration_s=4.0, world_size=300, communication_range=200.0),
 ]
 flights = zip(fly_batch(scenarios, bundle), scenarios)
-print(json.dumps([(a.positions_m == fly(b, bundle).positions_m).all().item() for a, b in flights]))
+same = [a.positions_m == fly_points(b, bundle).positions_m for a, b in flights]
+print(json.dumps([each.all().item() for each in same]))
 """
 
 # Another policy, with the golden outputs of this one.

@@ -14,7 +14,7 @@ import torch
 from edge.core.schema import ConfigError
 from edge.policy.bundle import load_bundle
 from edge.policy.family import Observation
-from lpac.sim.experiment import fly
+from lpac.sim.points import fly_points
 from lpac.sim.scenario import Scenario
 from lpac.train.config import config_of
 from lpac.train.run import TrainingRun
@@ -88,7 +88,7 @@ def test_the_command_says_that_it_computes_what_torch_did(site: Path, bundle: Pa
 def test_robots_that_hear_each_other_come_to_fly_alike(bundle: Path) -> None:
     from lpac_flocking.task import disagreement_m_s, speed_m_s  # noqa: PLC0415
 
-    flown = fly(Scenario(robots=6, seed=4, duration_s=25.0), load_bundle(bundle))
+    flown = fly_points(Scenario(robots=6, seed=4, duration_s=25.0), load_bundle(bundle))
     apart = disagreement_m_s(flown.time_s, flown.positions_m)
     assert apart[-25:].mean() < 0.5 * apart[5:30].mean(), apart[::10]
     assert speed_m_s(flown.time_s, flown.positions_m)[-25:].mean() > 0.2

@@ -32,7 +32,8 @@ ALLOWED = {
     "lpac.shipped": set(),
     # The Python API: hands on what these have.
     "lpac.api": {
-        *_EDGE, "lpac.shipped", "lpac.analysis", "lpac.sim", "lpac.sim.batch", "lpac.study",
+        *_EDGE, "lpac.shipped", "lpac.analysis", "lpac.sim", "lpac.sim.batch", "lpac.sim.engines",
+        "lpac.study",
     },
     "lpac.analysis": _EDGE,
     "lpac.ground": {*_EDGE, "lpac.analysis", "lpac.fleet.settings", "lpac.radio"},
@@ -60,7 +61,7 @@ ALLOWED = {
         "lpac.radio", "lpac.sim.ports", "lpac.sim.programs",
     },
     # Nothing of the simulators needs it.
-    "lpac.sim.batch": {*_EDGE, "lpac.sim"},
+    "lpac.sim.batch": {*_EDGE, "lpac.analysis", "lpac.sim"},
     "lpac.sim.engines": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.sim.batch"},
     "lpac.study": {
         *_EDGE, "lpac.shipped", "lpac.analysis", "lpac.radio", "lpac.sim", "lpac.sim.engines",

@@ -12,7 +12,8 @@ import numpy as np
 from edge.core import F64
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.analysis import style
-from lpac.sim.experiment import fly, prepare
+from lpac.api import fly
+from lpac.sim.points import prepare
 from lpac.sim.scenario import Scenario
 from lpac_flocking.task import FlockExpert, disagreement_m_s, speed_m_s
 
@@ -54,7 +55,7 @@ def main() -> None:
     }
     with style.figure(style.WIDTH_IN, 2.6) as figure:
         tracks, alone, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.3))
-        world_m = flown.perception.world_size / scenario.scale.env_scale
+        world_m = scenario.perception_of(bundle).world_size / scenario.scale.env_scale
         for axes, flight, title in ((tracks, flown, "policy"), (alone, deaf, "no messages")):
             for robot in range(scenario.robots):
                 x_m, y_m = flight.positions_m[:, robot].T

@@ -9,7 +9,7 @@ from edge.core import F64, Bools
 from edge.core.frames import ModelScale
 from lpac.analysis.flight import FlightRecord
 from lpac.sim.baselines import BaselineName
-from lpac.sim.experiment import Preparation
+from lpac.sim.points import Preparation
 from lpac.study.flights import CostCurve, FlightGroup, PlannedFlight, records_of
 from lpac.train.config import DataConfig
 from lpac_flocking.policy import away_from_close, place_in

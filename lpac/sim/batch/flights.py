@@ -2,7 +2,7 @@
 
 Each world runs on until one of its robots needs a velocity that is not computed yet. When all
 worlds wait, what has gathered is computed in batches. The order in which robots, messages and
-vehicles act is that of `lpac.sim.experiment.fly`, and so is what comes out, for the same seed.
+vehicles act is that of `lpac.sim.points.fly`, and so is what comes out, for the same seed.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,10 +16,11 @@ from edge.core.perception import PerceptionParameters
 from edge.core.ports import OdometrySource
 from edge.policy.bundle import Bundle
 from edge.robot.pac import PacParameters
+from lpac.analysis.flight import FlightRecord
 from lpac.sim.batch.agents import Agents, make_agents
 from lpac.sim.batch.robot import BatchedRobot, DeferredSteps
 from lpac.sim.batch.seen import ShownWorld
-from lpac.sim.experiment import Preparation, SimulatedFlight, WorldMoment, prepare
+from lpac.sim.points import Preparation, WorldMoment, prepare
 from lpac.sim.scenario import Scenario
 from lpac.sim.swarm import Swarm
 from lpac.sim.vehicles import PointVehicles
@@ -153,8 +154,8 @@ class BatchedFlights:
         )
 
 
-def fly_batch(scenarios: Sequence[Scenario], bundle: Bundle) -> list[SimulatedFlight]:
-    """Simulate `scenarios`, all with `bundle`: what `lpac.sim.experiment.fly` does one by one.
+def fly_batch(scenarios: Sequence[Scenario], bundle: Bundle) -> list[FlightRecord]:
+    """Simulate `scenarios`, all with `bundle`: what `lpac.sim.points.fly` does one by one.
 
     Raises BundleError and ConfigError for a bundle that cannot fly, ValueError for impossible
     scenarios and for baselines, PolicyFailedError for a policy that computes what robots refuse.
@@ -169,6 +170,6 @@ def fly_batch(scenarios: Sequence[Scenario], bundle: Bundle) -> list[SimulatedFl
                 flown_m.append(swarm.positions_m())
     flights.finish()
     return [
-        world.flight(np.array(flown_m), swarm.message_counts(), swarm.largest_payload)
+        world.record(np.array(flown_m), swarm.message_counts(), swarm.largest_payload)
         for world, swarm, flown_m in zip(flights.prepared, flights.swarms, positions_m, strict=True)
     ]

@@ -119,7 +119,7 @@ class DeferredSteps:
         if not (np.isfinite(velocities).all() and (largest <= self._payload_limit).all()):
             raise PolicyFailedError(
                 "a velocity or a payload of the policy is not finite, or beyond the bundle's "
-                "payload_limit: `lpac.sim.experiment.fly` shows what robots do then"
+                "payload_limit: `lpac.sim.points.fly` shows what robots do then"
             )
         for i, step in enumerate(steps):
             step.velocity = velocities[i]

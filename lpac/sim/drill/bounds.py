@@ -12,10 +12,12 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from edge.core import F64, Bools
+from edge.core.fence import Fence
 from edge.flight.margins import ErrorBudget
-from lpac.sim.drill.truth import FlightTruth, VehicleTruth
+from lpac.analysis.flight import FlightRecord
+from lpac.analysis.truth import TrueTrack
 from lpac.sim.px4.errors import GREATEST_BIAS_M
-from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.modes import PILOTED, Px4Mode
 
 Whose = Literal["hit", "next", "others", "all", "first half", "second half"]
 
@@ -74,7 +76,7 @@ class Figure(NamedTuple):
 class Criterion(Protocol):
     """One promise."""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         """What came of it in this flight."""
         ...
 
@@ -86,20 +88,20 @@ class Criterion(Protocol):
 class Apart:
     """No two vehicles touch in the air, and nobody comes down on one that stands."""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         least_m = math.inf
         for one, other in combinations(flight.vehicles, 2):
             distance_m = _distances_m(one, other)
             if len(distance_m):
                 least_m = min(least_m, float(distance_m.min()))
-        return Figure("true separation", least_m, flight.drone_m, "m", at_least=True)
+        return Figure("true separation", least_m, flight.fault.drone_m, "m", at_least=True)
 
 
 @dataclass(frozen=True, slots=True)
 class AllKnown:
     """The truth is known at all times: nothing that is not a number would break another promise."""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         unknown = sum(
             int((~np.isfinite(each)).sum())
             for vehicle in flight.vehicles
@@ -118,10 +120,10 @@ class InsideFence:
     beyond_m: float = POSITION_ERROR_M
     whose: Whose = "all"
 
-    def figure(self, flight: FlightTruth) -> Figure:
-        edges, margins_m = flight.fence.edges(), [math.inf]
+    def figure(self, flight: FlightRecord) -> Figure:
+        edges, margins_m = _fence(flight).edges(), [math.inf]
         for vehicle in _of(flight, self.whose):
-            flown_m = vehicle.position_m[vehicle.airborne & vehicle.armed & ~vehicle.piloted]
+            flown_m = vehicle.position_m[vehicle.airborne & vehicle.armed & ~_piloted(vehicle)]
             margins_m += [float(edges.distances_m(place_m).min()) for place_m in flown_m[:, :2]]
         of = " of who is carried" if self.beyond_m != POSITION_ERROR_M else ""
         return Figure(f"true fence margin{of}", min(margins_m), -self.beyond_m, "m", at_least=True)
@@ -133,12 +135,12 @@ class BelowCeiling:
 
     above_m: float = _BUDGET.height_m
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         highest_m = max(
-            float(np.where(v.piloted, 0.0, v.position_m[:, 2]).max(initial=0.0))
+            float(np.where(_piloted(v), 0.0, v.position_m[:, 2]).max(initial=0.0))
             for v in flight.vehicles
         )
-        limit_m = flight.fence.ceiling_m + self.above_m
+        limit_m = _fence(flight).ceiling_m + self.above_m
         return Figure("greatest height", highest_m, limit_m, "m")
 
 
@@ -146,10 +148,10 @@ class BelowCeiling:
 class NoUnorderedStart:
     """No motor starts but on a takeoff order just given to that robot, and on each only once."""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         unordered = 0
         for robot, vehicle in enumerate(flight.vehicles):
-            orders = flight.ordered("takeoff", robot)
+            orders = flight.fault.ordered("takeoff", robot)
             for at_s in _rises_s(vehicle):
                 obeyed = [o for o in orders if o.began_s <= at_s <= o.ended_s + _ARMED_AFTER_S]
                 if obeyed:
@@ -163,7 +165,7 @@ class NoUnorderedStart:
 class NobodyFalls:
     """No motor stops in the air, unless the operator kills that robot."""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         highest_m = 0.0
         for vehicle in _unkilled(flight):
             stops = np.flatnonzero(vehicle.armed[:-1] & ~vehicle.armed[1:]) + 1
@@ -175,7 +177,7 @@ class NobodyFalls:
 class ComesDownGently:
     """Nobody hits the ground, unless the operator kills that robot."""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         fastest_m_s = 0.0
         for vehicle in _unkilled(flight):
             touches = np.flatnonzero(vehicle.airborne[:-1] & ~vehicle.airborne[1:])
@@ -189,11 +191,11 @@ class ComesDownGently:
 class PilotIsAlone:
     """A vehicle that a pilot flies is sent nothing, once that can be known."""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         latest_s = 0.0
         for robot, vehicle in enumerate(flight.vehicles):
-            rejoined_s = [order.began_s for order in flight.ordered("rejoin", robot)]
-            for begin_s, end_s in _spans_s(vehicle, vehicle.piloted & vehicle.armed):
+            rejoined_s = [order.began_s for order in flight.fault.ordered("rejoin", robot)]
+            for begin_s, end_s in _spans_s(vehicle, _piloted(vehicle) & vehicle.armed):
                 sent_s = np.unique(vehicle.between(begin_s, end_s).setpoint_at_s)
                 sent_s = sent_s[(sent_s > begin_s) & (sent_s <= end_s)]
                 for at_s in rejoined_s:
@@ -208,7 +210,7 @@ class PilotIsAlone:
 class AllDown:
     """In the end all stand on the ground, with their motors off."""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         up = sum(bool(v.armed[-1] or v.airborne[-1]) for v in flight.vehicles)
         return Figure("not down in the end", up, 0, "")
 
@@ -223,7 +225,7 @@ class FewCommands:
     within_s: float
     most: int
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         most = 0
         for vehicle in flight.vehicles:
             before = np.searchsorted(vehicle.time_s, vehicle.time_s - self.within_s)
@@ -255,7 +257,7 @@ class Lands:
     whose: Whose = "hit"
     after: str = ""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         since_s = _since_s(flight, self.after)
         delays_s = []
         for vehicle in _of(flight, self.whose):
@@ -272,12 +274,11 @@ class NotLandedBefore:
     before_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         delays_s = []
-        for vehicle in _of(flight, self.whose):
-            later = vehicle.between(flight.fault_s, math.inf)
+        for later in _parts(flight, self.whose):
             at_s = later.time_s[later.is_in(*LANDING) | ~later.armed]
-            delays_s.append(float(at_s[0]) - flight.fault_s if len(at_s) else math.inf)
+            delays_s.append(float(at_s[0]) - flight.fault.begin_s if len(at_s) else math.inf)
         return Figure("lands no sooner", min(delays_s), self.before_s, "s", at_least=True)
 
 
@@ -288,14 +289,13 @@ class Down:
     within_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         latest_s = 0.0
-        for vehicle in _of(flight, self.whose):
-            later = vehicle.between(flight.fault_s, math.inf)
+        for later in _parts(flight, self.whose):
             up = np.flatnonzero(later.armed | later.airborne)
             down = not len(up) or up[-1] + 1 < len(later.time_s)
-            at_s = float(later.time_s[up[-1]]) if len(up) else flight.fault_s
-            latest_s = max(latest_s, at_s - flight.fault_s if down else math.inf)
+            at_s = float(later.time_s[up[-1]]) if len(up) else flight.fault.begin_s
+            latest_s = max(latest_s, at_s - flight.fault.begin_s if down else math.inf)
         return Figure("down", latest_s, self.within_s, "s")
 
 
@@ -314,7 +314,7 @@ class Stands:
     after: str = ""
     may_part: bool = False
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         since_s, fastest_m_s = _since_s(flight, self.after), 0.0
         for vehicle in _of(flight, self.whose):
             part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
@@ -337,7 +337,7 @@ class StaysNear:
     whose: Whose = "hit"
     after: str = ""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         since_s, farthest_m = _since_s(flight, self.after), 0.0
         for vehicle in _of(flight, self.whose):
             part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
@@ -354,10 +354,9 @@ class StraightDown:
     within_m: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         farthest_m = 0.0
-        for vehicle in _of(flight, self.whose):
-            later = vehicle.between(flight.fault_s, math.inf)
+        for later in _parts(flight, self.whose):
             landing = later.position_m[later.is_in(*LANDING)]
             if len(landing):
                 offset_m = landing[:, :2] - landing[0, :2]
@@ -373,7 +372,7 @@ class LandApart:
 
     whose: Whose = "all"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         landed = [v for v in _of(flight, self.whose) if v.is_in(*LANDING).any()]
         least_m = min(
             (
@@ -395,16 +394,16 @@ class LandsAtPad:
     within_m: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         farthest_m = 0.0
         places_m = [vehicle.position_m[-1, :2] for vehicle in flight.vehicles]
         strays_m = [
             place_m
-            for place_m, pad_m in zip(places_m, flight.pads_m, strict=False)
+            for place_m, pad_m in zip(places_m, flight.fault.pads_m, strict=False)
             if math.dist(place_m, pad_m) > self.within_m
         ]
         for robot in _robots(flight, self.whose):
-            place_m, pad_m = places_m[robot], flight.pads_m[robot]
+            place_m, pad_m = places_m[robot], flight.fault.pads_m[robot]
             away_m = math.dist(place_m, pad_m)
             is_beside = any(
                 place_m is not stray_m and math.dist(stray_m, pad_m) < _NEAR_M
@@ -424,7 +423,7 @@ class FliesOn:
     from_s: float = 0.0
     after: str = ""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         since_s, shares = _since_s(flight, self.after), [1.0]
         for vehicle in _of(flight, self.whose):
             part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
@@ -444,14 +443,13 @@ class ComesBack:
     within_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
-        edges, latest_s = flight.fence.edges(), 0.0
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(flight.fault_s, math.inf)
+    def figure(self, flight: FlightRecord) -> Figure:
+        edges, latest_s = _fence(flight).edges(), 0.0
+        for part in _parts(flight, self.whose):
             flown = part.airborne & part.armed & ~part.is_in(Px4Mode.HOLD, *LANDING)
             for at_s, place_m in zip(part.time_s[flown], part.position_m[flown, :2], strict=True):
                 if edges.distances_m(place_m).min() < -POSITION_ERROR_M:
-                    latest_s = max(latest_s, float(at_s) - flight.fault_s)
+                    latest_s = max(latest_s, float(at_s) - flight.fault.begin_s)
         return Figure("flown beyond the fence", latest_s, self.within_s, "s")
 
 
@@ -463,11 +461,11 @@ class Moves:
     until_s: float
     whose: Whose = "all"
 
-    def figure(self, flight: FlightTruth) -> Figure:
-        ways_m = []
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(flight.fault_s, flight.fault_s + self.until_s)
-            ways_m.append(float(np.hypot(*np.diff(part.position_m[:, :2], axis=0).T).sum()))
+    def figure(self, flight: FlightRecord) -> Figure:
+        ways_m = [
+            float(np.hypot(*np.diff(part.position_m[:, :2], axis=0).T).sum())
+            for part in _parts(flight, self.whose, until_s=self.until_s)
+        ]
         return Figure("flies at least", min(ways_m), self.least_m, "m", at_least=True)
 
 
@@ -478,12 +476,11 @@ class Holds:
     within_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         delays_s = []
-        for vehicle in _of(flight, self.whose):
-            later = vehicle.between(flight.fault_s, math.inf)
+        for later in _parts(flight, self.whose):
             at_s = later.time_s[later.is_in(Px4Mode.HOLD)]
-            delays_s.append(float(at_s[0]) - flight.fault_s if len(at_s) else math.inf)
+            delays_s.append(float(at_s[0]) - flight.fault.begin_s if len(at_s) else math.inf)
         return Figure("PX4 holds", max(delays_s), self.within_s, "s")
 
 
@@ -493,9 +490,9 @@ class KeepsAway:
 
     least_m: float
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         least_m = math.inf
-        for robot, following in zip(flight.hit, _robots(flight, "next"), strict=True):
+        for robot, following in zip(flight.fault.hit, _robots(flight, "next"), strict=True):
             one, other = flight.vehicles[robot], flight.vehicles[following]
             least_m = min(least_m, float(_distances_m(one, other).min(initial=math.inf)))
         return Figure("keeps away", least_m, self.least_m, "m", at_least=True)
@@ -510,7 +507,7 @@ class MissionEnds:
     whose: Whose = "hit"
     after: str = ""
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         since_s, latest_s = _since_s(flight, self.after), 0.0
         for vehicle in _of(flight, self.whose):
             part = vehicle.between(since_s, since_s + self.until_s)
@@ -527,14 +524,13 @@ class LeavesMission:
     within_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         latest_s = -math.inf
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(flight.fault_s, math.inf)
+        for part in _parts(flight, self.whose):
             height_m = part.position_m[:, 2]
             low = np.flatnonzero(height_m < height_m[0] - self.below_m)
             flown = part.setpoint_at_s[part.is_velocity & part.is_in(Px4Mode.OFFBOARD)]
-            ended_s = float(flown.max(initial=flight.fault_s))
+            ended_s = float(flown.max(initial=flight.fault.begin_s))
             latest_s = max(latest_s, ended_s - float(part.time_s[low[0]]) if len(low) else math.inf)
         return Figure("leaves the mission", latest_s, self.within_s, "s")
 
@@ -547,12 +543,11 @@ class FallsSilent:
     until_s: float = math.inf
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         latest_s = 0.0
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(flight.fault_s, flight.fault_s + self.until_s)
-            sent_s = float(part.setpoint_at_s.max(initial=flight.fault_s))
-            latest_s = max(latest_s, sent_s - flight.fault_s)
+        for part in _parts(flight, self.whose, until_s=self.until_s):
+            sent_s = float(part.setpoint_at_s.max(initial=flight.fault.begin_s))
+            latest_s = max(latest_s, sent_s - flight.fault.begin_s)
         return Figure("last setpoint", latest_s, self.within_s, "s")
 
 
@@ -564,9 +559,9 @@ class SentNothing:
     until_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         """How many came."""
-        begin_s, end_s = flight.fault_s + self.from_s, flight.fault_s + self.until_s
+        begin_s, end_s = flight.fault.begin_s + self.from_s, flight.fault.begin_s + self.until_s
         sent = 0
         for vehicle in _of(flight, self.whose):
             at_s = np.unique(vehicle.between(begin_s, end_s).setpoint_at_s)
@@ -580,9 +575,10 @@ class StaysDown:
 
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         started = sum(
-            bool(v.between(flight.fault_s, math.inf).armed.any()) for v in _of(flight, self.whose)
+            bool(v.between(flight.fault.begin_s, math.inf).armed.any())
+            for v in _of(flight, self.whose)
         )
         return Figure("took off", started, 0, "")
 
@@ -593,9 +589,9 @@ class TakesOff:
 
     whose: Whose = "all"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         flew = min(
-            bool((v.armed & v.airborne)[v.time_s > flight.fault_s].any())
+            bool((v.armed & v.airborne)[v.time_s > flight.fault.begin_s].any())
             for v in _of(flight, self.whose)
         )
         return Figure("took off", flew, 1, "", at_least=True)
@@ -608,12 +604,13 @@ class MotorsOff:
     within_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         latest_s = 0.0
-        for vehicle in _of(flight, self.whose):
-            later = vehicle.between(flight.fault_s, math.inf)
+        for later in _parts(flight, self.whose):
             off_s = later.time_s[~later.armed]
-            latest_s = max(latest_s, float(off_s[0]) - flight.fault_s if len(off_s) else math.inf)
+            latest_s = max(
+                latest_s, float(off_s[0]) - flight.fault.begin_s if len(off_s) else math.inf
+            )
         return Figure("motors off", latest_s, self.within_s, "s")
 
 
@@ -625,10 +622,9 @@ class KeepsHeight:
     until_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         farthest_m = 0.0
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(flight.fault_s, flight.fault_s + self.until_s)
+        for part in _parts(flight, self.whose, until_s=self.until_s):
             heights_m = part.position_m[part.is_in(Px4Mode.OFFBOARD), 2]
             if len(heights_m):
                 farthest_m = max(farthest_m, float(np.abs(heights_m - heights_m[0]).max()))
@@ -642,10 +638,10 @@ class Climbs:
     at_most_m: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         farthest_m = 0.0
-        for vehicle in _of(flight, self.whose):
-            heights_m = vehicle.between(flight.fault_s, math.inf).position_m[:, 2]
+        for part in _parts(flight, self.whose):
+            heights_m = part.position_m[:, 2]
             climbed_m = heights_m - np.minimum.accumulate(heights_m)
             farthest_m = max(farthest_m, float(climbed_m.max(initial=0.0)))
         return Figure("climbs again", farthest_m, self.at_most_m, "m")
@@ -659,53 +655,69 @@ class NotFaster:
     until_s: float
     whose: Whose = "hit"
 
-    def figure(self, flight: FlightTruth) -> Figure:
+    def figure(self, flight: FlightRecord) -> Figure:
         fastest_m_s = 0.0
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(flight.fault_s, flight.fault_s + self.until_s)
+        for part in _parts(flight, self.whose, until_s=self.until_s):
             flown = part.velocity_m_s[part.is_in(Px4Mode.OFFBOARD) & part.airborne, :2]
             fastest_m_s = max(fastest_m_s, float(np.hypot(*flown.T).max(initial=0.0)))
         return Figure("greatest speed", fastest_m_s, self.speed_m_s, "m/s")
 
 
-def judge(bounds: Sequence[Criterion], flight: FlightTruth) -> tuple[Figure, ...]:
+def judge(bounds: Sequence[Criterion], flight: FlightRecord) -> tuple[Figure, ...]:
     """All figures, those of every flight and the fault's own."""
     return tuple(bound.figure(flight) for bound in bounds)
 
 
-def _robots(flight: FlightTruth, whose: Whose) -> tuple[int, ...]:
+def _robots(flight: FlightRecord, whose: Whose) -> tuple[int, ...]:
     everybody = tuple(range(len(flight.vehicles)))
-    following = tuple((robot + 1) % len(everybody) for robot in flight.hit)
+    following = tuple((robot + 1) % len(everybody) for robot in flight.fault.hit)
+    others = tuple(robot for robot in everybody if robot not in flight.fault.hit)
     half = (len(everybody) + 1) // 2
     return {
-        "hit": flight.hit, "next": following, "others": flight.others, "all": everybody,
+        "hit": flight.fault.hit, "next": following, "others": others, "all": everybody,
         "first half": everybody[:half], "second half": everybody[half:],
     }[whose]  # fmt: skip
 
 
-def _of(flight: FlightTruth, whose: Whose) -> Iterator[VehicleTruth]:
+def _fence(flight: FlightRecord) -> Fence:
+    assert flight.fence is not None
+    return flight.fence
+
+
+def _parts(flight: FlightRecord, whose: Whose, *, until_s: float = math.inf) -> Iterator[TrueTrack]:
+    """Of each of them what it did from the fault on, and until then."""
+    begin_s = flight.fault.begin_s
+    return (vehicle.between(begin_s, begin_s + until_s) for vehicle in _of(flight, whose))
+
+
+def _piloted(vehicle: TrueTrack) -> Bools:
+    """(T,): whether somebody flies it by hand."""
+    return vehicle.is_in(*PILOTED)
+
+
+def _of(flight: FlightRecord, whose: Whose) -> Iterator[TrueTrack]:
     return (flight.vehicles[robot] for robot in _robots(flight, whose))
 
 
-def _unkilled(flight: FlightTruth) -> Iterator[VehicleTruth]:
+def _unkilled(flight: FlightRecord) -> Iterator[TrueTrack]:
     return (
         vehicle
         for robot, vehicle in enumerate(flight.vehicles)
-        if not flight.ordered("kill", robot)
+        if not flight.fault.ordered("kill", robot)
     )
 
 
-def _since_s(flight: FlightTruth, mark: str) -> float:
-    return flight.marks[mark] if mark else flight.fault_s
+def _since_s(flight: FlightRecord, mark: str) -> float:
+    return flight.fault.marks[mark] if mark else flight.fault.begin_s
 
 
-def _rises_s(vehicle: VehicleTruth) -> list[float]:
+def _rises_s(vehicle: TrueTrack) -> list[float]:
     rises = np.flatnonzero(vehicle.armed[1:] & ~vehicle.armed[:-1]) + 1
     starts: list[float] = vehicle.time_s[rises].tolist()
     return starts
 
 
-def _spans_s(vehicle: VehicleTruth, holds: Bools) -> list[tuple[float, float]]:
+def _spans_s(vehicle: TrueTrack, holds: Bools) -> list[tuple[float, float]]:
     """From when to when something holds."""
     steps = np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8))
     begins, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1
@@ -713,10 +725,10 @@ def _spans_s(vehicle: VehicleTruth, holds: Bools) -> list[tuple[float, float]]:
     return [(float(times_s[b]), float(times_s[e])) for b, e in zip(begins, ends, strict=True)]
 
 
-def _alone_m(flight: FlightTruth, vehicle: VehicleTruth, times_s: F64) -> F64:
+def _alone_m(flight: FlightRecord, vehicle: TrueTrack, times_s: F64) -> F64:
     """(T,): how far the nearest other vehicle is at each time, in the plane."""
 
-    def place_m(of: VehicleTruth) -> F64:
+    def place_m(of: TrueTrack) -> F64:
         axes = [np.interp(times_s, of.time_s, of.position_m[:, axis]) for axis in range(2)]
         return np.stack(axes, axis=1)
 
@@ -730,7 +742,7 @@ def _alone_m(flight: FlightTruth, vehicle: VehicleTruth, times_s: F64) -> F64:
     return nearest_m
 
 
-def _distances_m(one: VehicleTruth, other: VehicleTruth) -> F64:
+def _distances_m(one: TrueTrack, other: TrueTrack) -> F64:
     """3-D, at all times when at least one of the two is in the air."""
     times_s = one.time_s
     if len(times_s) == len(other.time_s) and np.abs(times_s - other.time_s).max(initial=0) < 1e-6:

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from lpac.analysis import style
+from lpac.analysis.flight import FlightRecord
 from lpac.sim.drill.bounds import LANDING
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.truth import FlightTruth
 from lpac.sim.px4.modes import Px4Mode
 
 _MODES = (
@@ -19,7 +19,7 @@ _MODES = (
 _OTHER_MODE = style.PURPLE
 
 
-def write_figure(fault: Fault, flight: FlightTruth, folder: Path) -> None:
+def write_figure(fault: Fault, flight: FlightRecord, folder: Path) -> None:
     """drill.png and drill.pdf in `folder`."""
     with style.figure(style.WIDTH_IN, 4.0) as figure:
         columns = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.1))
@@ -32,25 +32,26 @@ def write_figure(fault: Fault, flight: FlightTruth, folder: Path) -> None:
     style.save(figure, folder / "drill")
 
 
-def _draw_map(axes: Axes, flight: FlightTruth) -> None:
+def _draw_map(axes: Axes, flight: FlightRecord) -> None:
+    assert flight.fence is not None
     corners = np.array([*flight.fence.vertices_m, flight.fence.vertices_m[0]])
     axes.plot(*corners.T, color=style.INK, linewidth=0.8, linestyle="--", label="fence")
     for robot, vehicle in enumerate(flight.vehicles):
         colour = style.robot_colour(robot)
-        hit = robot in flight.hit
+        hit = robot in flight.fault.hit
         label = f"r{robot}, hit" if hit else f"r{robot}"
         path_m = vehicle.position_m[:, :2]
         axes.plot(*path_m.T, color=colour, linewidth=1.6 if hit else 0.7, label=label)
-        axes.plot(*flight.pads_m[robot], "s", color=colour, markersize=4, fillstyle="none")
+        axes.plot(*flight.fault.pads_m[robot], "s", color=colour, markersize=4, fillstyle="none")
         axes.plot(*path_m[-1], "v", color=colour, markersize=4)
-        at = min(int(np.searchsorted(vehicle.time_s, flight.fault_s)), len(path_m) - 1)
+        at = min(int(np.searchsorted(vehicle.time_s, flight.fault.begin_s)), len(path_m) - 1)
         axes.plot(*path_m[at], "o", color=colour, markersize=4)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     axes.set_title("square: pad; dot: at the fault; triangle: in the end", fontsize=6)
     axes.legend(fontsize=6, loc="best")
 
 
-def _draw_modes(axes: Axes, flight: FlightTruth) -> None:
+def _draw_modes(axes: Axes, flight: FlightRecord) -> None:
     for robot, vehicle in enumerate(flight.vehicles):
         drawn = ~vehicle.armed
         for modes, _, colour in _MODES:
@@ -60,7 +61,7 @@ def _draw_modes(axes: Axes, flight: FlightTruth) -> None:
         _bar(axes, vehicle.time_s, ~drawn, robot, _OTHER_MODE)
     for _, name, colour in (*_MODES, ((), "other", _OTHER_MODE)):
         axes.fill_between([], [], [], color=colour, label=name)
-    axes.axvline(flight.fault_s, color=style.VERMILLION, linewidth=0.8)
+    axes.axvline(flight.fault.begin_s, color=style.VERMILLION, linewidth=0.8)
     axes.set(ylabel="PX4's mode", ylim=(len(flight.vehicles) - 0.5, -0.5))
     axes.set_yticks(range(len(flight.vehicles)), [f"r{i}" for i in range(len(flight.vehicles))])
     axes.legend(fontsize=6, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
@@ -72,11 +73,11 @@ def _bar(axes: Axes, time_s: np.ndarray, chosen: np.ndarray, robot: int, colour:
     )
 
 
-def _draw_heights(axes: Axes, flight: FlightTruth) -> None:
+def _draw_heights(axes: Axes, flight: FlightRecord) -> None:
     for robot, vehicle in enumerate(flight.vehicles):
         axes.plot(
             vehicle.time_s, vehicle.position_m[:, 2], color=style.robot_colour(robot),
-            linewidth=1.6 if robot in flight.hit else 0.8,
+            linewidth=1.6 if robot in flight.fault.hit else 0.8,
         )  # fmt: skip
-    axes.axvline(flight.fault_s, color=style.VERMILLION, linewidth=0.8)
+    axes.axvline(flight.fault.begin_s, color=style.VERMILLION, linewidth=0.8)
     axes.set(xlabel="time (s)", ylabel="true height (m)")

@@ -76,7 +76,6 @@ class Timeline(NamedTuple):
 
     hit: tuple[int, ...]
     fault_s: float
-    calm_s: float
     marks: Mapping[str, float]
 
 
@@ -118,14 +117,13 @@ def fly(field: Field, fault: Fault, scenario: Scenario) -> Procedure[Timeline]:
     if fault.phase == "return":
         yield from _command(field, SafetyCommand("return", wait=True))
     yield from _wait(max(0.0, fault_s + fault.watched_s - field.now_s()))
-    calm_s = field.now_s()
     if fault.home:
         for action in ("return", "land"):
             if not field.all_down():
                 yield from _command(field, SafetyCommand(action, wait=True))
     yield Until(lambda _: field.all_down(), _ALL_DOWN_S)
     yield from _wait(1.0)
-    return Timeline(hit, fault_s, calm_s, marks)
+    return Timeline(hit, fault_s, marks)
 
 
 def _command(field: Field, request: Request) -> Procedure[CommandReport | None]:

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from edge.core.part import PartError
+from lpac.analysis.flight import FlightRecord
 from lpac.sim.drill.bounds import Figure, judge
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.truth import FlightTruth
 
 # Two ticks of control that a robot left out in a flight, or as much of the vehicles' time.
 LATE_S = 0.25
@@ -33,20 +33,20 @@ class FlightOutcome(NamedTuple):
         return not self.error and not self.broken
 
 
-def outcome_of(fault: Fault, flown: Callable[[], FlightTruth]) -> FlightOutcome:
+def outcome_of(fault: Fault, flown: Callable[[], FlightRecord]) -> FlightOutcome:
     """Fly and judge. What raises is an outcome, too: no other flight is lost for it.
 
     Limits are the same in real time. So what breaks one while the machine is late is not judged.
     """
     try:
-        truth = flown()
-        figures = judge(fault.judged_by, truth)
+        flight = flown()
+        figures = judge(fault.judged_by, flight)
     except PartError as error:
         return FlightOutcome((), str(error))
     except Exception as error:
         return FlightOutcome((), f"{type(error).__name__}: {error}")
-    unjudged = ""
-    if truth.late_s > LATE_S and any(figure.broken for figure in figures):
+    late_s, unjudged = flight.fault.late_s, ""
+    if late_s > LATE_S and any(figure.broken for figure in figures):
         broken = ", ".join(figure.name for figure in figures if figure.broken)
-        unjudged = f"not judged ({broken}): this machine was {truth.late_s:.1f} s behind real time"
-    return FlightOutcome(figures, unjudged, truth.late_s)
+        unjudged = f"not judged ({broken}): this machine was {late_s:.1f} s behind real time"
+    return FlightOutcome(figures, unjudged, late_s)

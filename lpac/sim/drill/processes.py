@@ -12,7 +12,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -20,11 +19,13 @@ from typing import Any, Self, TypeVar
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.robot.config import Rates, load_config
+from lpac.analysis.flight import FlightRecord
+from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
 from lpac.ground.station.client import GroundError
 from lpac.ground.station.protocol import CommandReport, Request
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.field import FaultyFleet
+from lpac.sim.drill.field import FaultyFleet, has_remote_control
 from lpac.sim.drill.flight import Timeline, fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
     BatteryIs,
@@ -49,7 +50,6 @@ from lpac.sim.drill.injections import (
     VehicleInjection,
     WatchdogDies,
 )
-from lpac.sim.drill.truth import VehicleTruth, vehicle_truth
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.processes import Fleet
@@ -356,11 +356,11 @@ class MavlinkField(ProcessField):
         """To the vehicle itself."""
         injection.apply(self.vehicles[robot], robot, self)
 
-    def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
+    def tracks(self) -> tuple[TrueTrack, ...]:
         """What they noted."""
         with self.stepped:
             truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
-        return tuple(vehicle_truth(truth, self.layout.to_mission) for truth in truths)
+        return tuple(map(self.track_of, truths))
 
 
 class Px4Field(ProcessField):
@@ -421,12 +421,12 @@ class Px4Field(ProcessField):
             case _:
                 raise TypeError(f"{injection} is not done to a real PX4")
 
-    def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
+    def tracks(self) -> tuple[TrueTrack, ...]:
         """By PX4's own logs, which are whole once it has ended.
 
         Raises VehicleError without one, or if a PX4 has not taken what a fault is done by.
         """
-        px4s, truths = self.fleet.vehicles, []
+        px4s, tracks = self.fleet.vehicles, []
         assert isinstance(px4s, Px4Build)
         for robot, vehicle in enumerate(self.vehicles):
             if vehicle.unconfirmed:
@@ -435,15 +435,23 @@ class Px4Field(ProcessField):
             logged = px4s.logged_truth(robot)
             if not logged:
                 raise VehicleError(f"the PX4 of r{robot} has left no log of its flight")
-            truth = vehicle_truth(logged, self.layout.to_mission)
-            truths.append(
-                replace(
-                    truth,
-                    time_s=truth.time_s - self._made_s,
-                    setpoint_at_s=truth.setpoint_at_s - self._made_s,
-                )
-            )
-        return tuple(truths)
+            tracks.append(self.track_of(logged).shifted(-self._made_s))
+        return tuple(tracks)
+
+
+def fly_fault(fleet: Fleet, fault: Fault) -> FlightRecord:
+    """One flight of the fault; the fleet has its settings."""
+    with (
+        fleet,
+        GroundProgram(fleet.fleet_toml, fleet.name) as ground,
+        process_field(fleet, ground) as field,
+    ):
+        if has_remote_control(fault):
+            with field.stepped:
+                for vehicle in field.vehicles:
+                    vehicle.rc_connected = True
+        timeline = field.fly(fault, fleet.layout.scenario)
+    return field.record(timeline)
 
 
 @contextmanager

@@ -11,10 +11,12 @@ from typing import Any, NamedTuple, TypeVar, assert_never, get_args
 import numpy as np
 
 from edge.core import F64
+from lpac.analysis.flight import FlightRecord
+from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError, Procedure
 from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
 from lpac.sim.air import GROUND
-from lpac.sim.drill.faults import Fault
+from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.field import FaultyFleet, has_remote_control, settings_of
 from lpac.sim.drill.flight import fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
@@ -42,7 +44,6 @@ from lpac.sim.drill.injections import (
     VehicleInjection,
     WatchdogDies,
 )
-from lpac.sim.drill.truth import FlightTruth, VehicleTruth, vehicle_truth
 from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.direct import DirectVehicle
@@ -141,10 +142,9 @@ class SimulatedField(FaultyFleet):
             self.ground.node.begin(request)
         return self.ground_runs
 
-    def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
+    def tracks(self) -> tuple[TrueTrack, ...]:
         """What they noted."""
-        to_mission = self.layout.to_mission
-        return tuple(vehicle_truth(vehicle.truth, to_mission) for vehicle in self.vehicles)
+        return tuple(self.track_of(vehicle.truth) for vehicle in self.vehicles)
 
     def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
         """Now."""
@@ -245,8 +245,9 @@ class SimulatedDrill:
         self._key: object = None
         self._bases: _Bases | None = None
 
-    def fly(self, fault: Fault, scenario: Scenario, logs: Path | None = None) -> FlightTruth:
-        """One flight. With `logs` the robots write theirs in that folder."""
+    def fly(self, scenario: Scenario, logs: Path | None = None) -> FlightRecord:
+        """One flight of its fault. With `logs` the robots write theirs in that folder."""
+        fault = FAULTS[scenario.fault]
         on_ground = fault.phase in ("ready", "takeoff")
         if logs is None and scenario.sensor == WORLD_SENSOR:
             bases = self._of(fault, scenario)
@@ -259,10 +260,10 @@ class SimulatedDrill:
                 field.carry_out(to_mission(field))
         timeline = field.carry_out(fly(field, fault, scenario))
         field.fleet.close()
-        return field.truth(timeline)
+        return field.record(timeline)
 
     def _of(self, fault: Fault, scenario: Scenario) -> _Bases:
-        key = (scenario, fault.settings)
+        key = (replace(scenario, fault=""), fault.settings)
         if self._bases is None or key != self._key:
             with tempfile.TemporaryDirectory() as folder:
                 ready = self._ready(fault, scenario, Path(folder))

@@ -1,6 +1,7 @@
 """One flight of a fleet on the simulated clock, by a script of the real ground."""
 
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,17 +9,19 @@ import numpy as np
 from edge.core.logger import errors_only
 from edge.messages.mission import RobotStatus
 from edge.policy.bundle import load_bundle
+from lpac.analysis.flight import FlightRecord, ScriptRecord
 from lpac.analysis.logs import logs_of
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.air import Air
 from lpac.sim.failure import Failure
-from lpac.sim.fleet.flight import FleetFlight, RobotUsage, flight_of
+from lpac.sim.fleet.flight import FleetMoment, RobotUsage, flight_of
 from lpac.sim.fleet.listener import Say
 from lpac.sim.fleet.pilot import LOOKS_S, Pilot, perturbations
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
+from lpac.sim.points import SAMPLE_S
 from lpac.sim.scenario import Scenario
 
 # No flight lasts so long, and as many of them end before the year 2038.
@@ -30,10 +33,11 @@ def fly_simulated(
     folder: Path | str,
     bundle: Path | str,
     say: Say = lambda _: None,
+    watch: Callable[[FleetMoment], object] | None = None,
     *,
     logs: bool = False,
     recorded: Path | None = None,
-) -> FleetFlight:
+) -> FlightRecord:
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
     Robots fly the bundle at the path `bundle`, which stays where it is; `say` is told each step of
@@ -49,12 +53,18 @@ def fly_simulated(
     scenario.require_default("robots on a simulated clock", "transport")
     # What ten robots say to their own logs is nothing for a person.
     with errors_only():
-        return _fly(scenario, Path(folder), Path(bundle), say, logs, recorded)
+        return _fly(scenario, Path(folder), Path(bundle), say, watch, logs, recorded)
 
 
 def _fly(
-    scenario: Scenario, folder: Path, bundle: Path, say: Say, logs: bool, recorded: Path | None
-) -> FleetFlight:
+    scenario: Scenario,
+    folder: Path,
+    bundle: Path,
+    say: Say,
+    watch: Callable[[FleetMoment], object] | None,
+    logs: bool,
+    recorded: Path | None,
+) -> FlightRecord:
     earlier = set(folder.rglob("*.mcap"))
     # Logs of several flights, read together, must be of different times, and those of the same
     # flight, flown again, of the same.
@@ -93,6 +103,8 @@ def _fly(
         perturb=perturbations(scenario.failures),
         on_step=begin, say=say_when,
     )  # fmt: skip
+    if watch is not None:
+        fleet.schedule.every(SAMPLE_S, lambda: watch(_moment(fleet, flight)))
     notes = _Notes(fleet)
     try:
         problem = ground.carry_out(flight.fly())
@@ -100,6 +112,15 @@ def _fly(
         problem = str(error)
     fleet.close()
     return notes.flight(flight, problem, earlier, folder if logs else None)
+
+
+def _moment(fleet: SimulatedFleet, flight: ScriptedFlight) -> FleetMoment:
+    statuses = {robot.config.robot_id: robot.status for robot in fleet.robots}
+    return FleetMoment(
+        fleet.ground.now_s, flight.at,
+        {robot: status for robot, status in statuses.items() if status is not None},
+        flight.stop,
+    )  # fmt: skip
 
 
 class _Notes:
@@ -119,18 +140,16 @@ class _Notes:
 
     def flight(
         self, flown: ScriptedFlight, problem: str | None, earlier: set[Path], logged: Path | None
-    ) -> FleetFlight:
+    ) -> FlightRecord:
         self._look()
         fleet = self._fleet
         logs = sorted(set(fleet.folder.rglob("*.mcap")) - earlier)
         return flight_of(
             fleet.layout,
-            "simulated",
             logs_of(self._said.values()),
             self._tracks(),
             fleet.schedule.unix_s() - fleet.schedule.monotonic_s(),
             0.0,
-            flown.began_s | {"end": fleet.ground.now_s},
             [
                 RobotUsage(
                     logs=tuple(
@@ -142,8 +161,12 @@ class _Notes:
                 for robot in fleet.robots
             ],
             logged,
-            problem=problem,
-            commands=tuple(flown.commands),
+            ScriptRecord(
+                vehicle="simulated",
+                began_s=flown.began_s | {"end": fleet.ground.now_s},
+                problem=problem,
+                commands=flown.told_commands(),
+            ),
         )
 
     def _tracks(self) -> list[TrueTrack]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from edge.policy.bundle import load_bundle
-from lpac.sim.experiment import fly
+from lpac.sim.points import fly_points
 from lpac.sim.programs import python_program
 from lpac.sim.scenario import Scenario
 
@@ -68,7 +68,7 @@ def _units_per_s(bundle: Path) -> float:
 def _work(bundle_path: Path) -> None:
     """Say when ready, wait for the end of stdin, and say the units a second of each round."""
     bundle = load_bundle(bundle_path)
-    fly(_UNIT, bundle)
+    fly_points(_UNIT, bundle)
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     sys.stdin.read()
@@ -76,7 +76,7 @@ def _work(bundle_path: Path) -> None:
     for _ in range(_ROUNDS):
         began_s, units = time.monotonic(), 0
         while (past_s := time.monotonic() - began_s) < _ROUND_S:
-            fly(_UNIT, bundle)
+            fly_points(_UNIT, bundle)
             units += 1
         units_per_s.append(units / past_s)
     json.dump(units_per_s, sys.stdout)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from edge.core.vehicle import PILOTED
 from edge.messages.mission import FlightState
+from lpac.analysis.flight import ScriptCommand
 from lpac.analysis.snapshot import FleetSnapshot
 from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
 from lpac.ground.script import (
@@ -27,6 +28,7 @@ from lpac.ground.script import (
     failures,
 )
 from lpac.ground.site import Sites
+from lpac.ground.station.commands import in_words
 from lpac.ground.station.protocol import (
     CommandReport,
     Request,
@@ -56,8 +58,8 @@ class CommandOutcome(NamedTuple):
 class ScriptedFlight(ScriptListener):
     """One flight: `fly`, and `land` if that cannot go on, are procedures.
 
-    `began_s` tells when each step began first (the ground's clock), `commands` is all that was
-    commanded.
+    `at` is the step that it is at. `began_s` tells when each began first (the ground's clock),
+    `commands` is all that was commanded.
     """
 
     def __init__(
@@ -76,7 +78,7 @@ class ScriptedFlight(ScriptListener):
         """
         self.began_s: dict[str, float] = {}
         self.commands: list[CommandOutcome] = []
-        self._at = ""
+        self.at = ""
         self._taken_back_s = -math.inf
         self._ground = ground
         self._on_step = on_step
@@ -128,6 +130,22 @@ class ScriptedFlight(ScriptListener):
         report = yield from self._command(SafetyCommand("land", wait=True))
         return None if report.done else failures(report)
 
+    def stop(self) -> None:
+        """End the mission now: all return, and land."""
+        self._run.mission_ends = True
+
+    def told_commands(self) -> tuple[ScriptCommand, ...]:
+        """`commands` as a record has them."""
+        return tuple(
+            ScriptCommand(
+                in_words(request),
+                report.done,
+                report.problem.code if report.problem else None,
+                {result.robot: result.code for result in report.results},
+            )
+            for request, report in self.commands
+        )
+
     def _beside(self, script: Procedure[None]) -> Procedure[None]:
         """The script, whose commands are noted; beside it robots are taken back."""
         answer: CommandReport | bool | None = None
@@ -163,13 +181,13 @@ class ScriptedFlight(ScriptListener):
         self._taken_back_s = self._ground.now_s
         self._say(f"{', '.join(left)} left offboard: taken back")
         yield from self._command(RobotCommand("rejoin", left))
-        if self._at == "mission":
+        if self.at == "mission":
             yield from self._command(Start(left))
 
     def step(self, name: str, at_most_s: float | None) -> None:
         """A step begins."""
         self.began_s.setdefault(name, self._ground.now_s)
-        self._at = name
+        self.at = name
         self._on_step(name)
 
     def line(self, text: str) -> None:

@@ -56,7 +56,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[PlannedFlight, Fligh
 def test_flights_over_cores_hold_what_is_promised(
     flown: dict[PlannedFlight, FlightOutcome],
 ) -> None:
-    asked = [(flight.fault, flight.scenario.seed) for flight in flown]
+    asked = [(flight.scenario.fault, flight.scenario.seed) for flight in flown]
     assert asked == [("ground-dies", 1), ("landed", 1)]
     assert all(outcome.held for outcome in flown.values())
 
@@ -132,7 +132,7 @@ def test_a_flight_again_is_that_flight_with_logs_and_figure(
     result = called("drill", "--fault", "landed", "--seed", 1, "-n", 2, "--out", tmp_path, "--json")
     assert result.returncode == 0, (result.stdout, result.stderr)
     [told] = json.loads(result.stdout)["faults"]
-    first = next(outcome for flight, outcome in flown.items() if flight.fault == "landed")
+    first = next(its for flight, its in flown.items() if flight.scenario.fault == "landed")
     worst = {figure["name"]: figure["value"] for figure in told["worst"]}
     assert worst == {figure.name: figure.value for figure in first.figures}
     folder = tmp_path / "landed-1"
@@ -154,7 +154,9 @@ def test_a_file_of_faults_is_flown_as_a_study(
     result = called("study", file, "--out", tmp_path / "out", "--json")
     assert result.returncode == 0, (result.stdout, result.stderr)
     [told] = json.loads(result.stdout)["faults"]
-    outcome = next(outcome for flight, outcome in flown.items() if flight.fault == "landed")
+    outcome = next(
+        outcome for flight, outcome in flown.items() if flight.scenario.fault == "landed"
+    )
     worst = {figure["name"]: figure["value"] for figure in told["worst"]}
     assert worst == {figure.name: figure.value for figure in outcome.figures}
     assert (tmp_path / "out" / "README.md").exists() and (tmp_path / "out" / "drill.xml").exists()

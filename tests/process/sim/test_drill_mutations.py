@@ -168,6 +168,6 @@ def _broken_without(fault: str, robots: int) -> list[str]:
 def _broken(name: str, robots: int) -> list[str]:
     fault = FAULTS[name]
     with errors_only():
-        truth = _drill(robots).fly(fault, scenario_of(fault, 0, robots))
+        truth = _drill(robots).fly(scenario_of(fault, 0, robots))
     figures = judge(fault.judged_by, truth)
     return [figure.name for figure in figures if figure.broken]

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from lpac.sim.fleet import load
-from lpac.sim.fleet.flight import fly, summary_lines
+from lpac.sim.fleet.flight import fly_programs
 from lpac.sim.fleet.load import robots_carried
 from lpac.sim.fleet.processes import OVERLOADED_S, Fleet
 from lpac.sim.scenario import Scenario
+from lpac.sim.summary import summary_lines
 from tests.conftest import SHIPPED
 
 STEPS = (
@@ -33,7 +34,8 @@ def test_a_flight_that_falls_behind_ends_early_and_says_so_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_the_air: bool
 ) -> None:
     said: list[str] = []
-    fleet = Fleet(Scenario(robots=2), tmp_path, SHIPPED, say=said.append)
+    scenario = Scenario(robots=2)
+    fleet = Fleet(scenario, tmp_path, SHIPPED, say=said.append)
     assert fleet.simulated is not None
     vehicles = fleet.simulated.vehicles
 
@@ -48,12 +50,13 @@ def test_a_flight_that_falls_behind_ends_early_and_says_so_first(
         return behind_s
 
     monkeypatch.setattr(fleet.simulated, "lost_s", lost_s)
-    flight = fly(fleet, said.append)
+    flight = fly_programs(fleet, said.append)
     # What robots refuse follows from it, and is not said.
     fleet.say_unless_behind("robot 0 refuses takeoff")
-    assert flight.problem is not None and flight.overloaded
-    lines = summary_lines(flight)
-    assert lines[1:] == [f"PROBLEM: {flight.problem}"]
+    problem = flight.script.problem
+    assert problem is not None and flight.script.overloaded
+    lines = summary_lines(scenario, flight)
+    assert lines[1:] == [f"PROBLEM: {problem}"]
     assert "the vehicles fell 6.0 s behind real time" in lines[1] and lines[1].endswith("-n 1")
     assert not any("refuses" in line for line in said)
     steps = [line for line in said if line in STEPS]

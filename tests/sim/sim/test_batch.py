@@ -23,14 +23,15 @@ from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Bundle
 from edge.policy.family import Perceived
 from edge.policy.lpac.policy import LpacAgent
+from lpac.analysis.flight import FlightRecord
 from lpac.radio.airtime import TRANSPORTS, Wifi
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.batch import BatchedFlights, PolicyFailedError, fly_batch
 from lpac.sim.batch.agents import Inputs, LpacAgents, SingleAgents
 from lpac.sim.batch.seen import SeenMap, ShownWorld
 from lpac.sim.description import FIELD_SCALE
-from lpac.sim.experiment import SimulatedFlight, fly
 from lpac.sim.failure import Failure
+from lpac.sim.points import fly_points
 from lpac.sim.scenario import Scenario
 from lpac.sim.swarm import ClockedPac
 from lpac.sim.ticks import Clocks
@@ -49,10 +50,11 @@ HARD = Scenario(
 SLOW = Wifi(data_rate_mbit_s=8.0, multicast_rate_mbit_s=1.0)
 
 
-def assert_same(one: SimulatedFlight, other: SimulatedFlight) -> None:
+def assert_same(one: FlightRecord, other: FlightRecord) -> None:
     np.testing.assert_array_equal(one.positions_m, other.positions_m)
     np.testing.assert_array_equal(one.cost, other.cost)
-    assert one.summary() == other.summary()
+    assert one.message_counts == other.message_counts
+    assert (one.duration_s, one.bundle_id) == (other.duration_s, other.bundle_id)
     assert one.largest_payload == other.largest_payload
 
 
@@ -111,7 +113,7 @@ def test_flights_are_those_of_the_exact_simulator(
 ) -> None:
     bundle = unknown_matters(shipped_bundle, unknown)
     for batched, scenario in zip(fly_batch(flown, bundle), flown, strict=True):
-        assert_same(batched, fly(scenario, bundle))
+        assert_same(batched, fly_points(scenario, bundle))
 
 
 @pytest.mark.parametrize("unknown", [0.0, 0.3])
@@ -122,7 +124,7 @@ def test_robots_that_see_what_they_explored_fly_the_same(
     bundle = unknown_matters(request.getfixturevalue(name), unknown)
     flown = [HARD, Scenario(robots=3, duration_s=5.0, world_size=200)]
     for batched, scenario in zip(fly_batch(flown, bundle), flown, strict=True):
-        assert_same(batched, fly(scenario, bundle))
+        assert_same(batched, fly_points(scenario, bundle))
 
 
 @pytest.mark.slow
@@ -143,7 +145,7 @@ def test_robots_that_see_what_they_explored_fly_the_same(
 )
 def test_long_and_large_flights_too(shipped_bundle: Bundle, scenario: Scenario) -> None:
     [batched] = fly_batch([scenario], shipped_bundle)
-    assert_same(batched, fly(scenario, shipped_bundle))
+    assert_same(batched, fly_points(scenario, shipped_bundle))
 
 
 def test_payloads_arrive_as_they_are_encoded(shipped_bundle: Bundle) -> None:
@@ -187,8 +189,8 @@ def test_a_perception_is_computed_once_for_all_steps_that_follow_it(
     clocks = Clocks(perception_s=0.5, policy_s=0.1)
     scenario = Scenario(robots=3, duration_s=4.0, clocks=clocks)
     [flight] = fly_batch([scenario], shipped_bundle)
-    assert flight.messages["broadcasts"] > 3 * 35 and len(computed) <= 3 * 9
-    assert_same(flight, fly(scenario, shipped_bundle))
+    assert flight.message_counts["broadcasts"] > 3 * 35 and len(computed) <= 3 * 9
+    assert_same(flight, fly_points(scenario, shipped_bundle))
 
 
 @settings(max_examples=60, deadline=None)
@@ -241,7 +243,7 @@ def test_inputs_at_a_moment_are_what_robots_perceived(
 
     monkeypatch.setattr(ClockedPac, "perceive", noted)
     scenario = dataclasses.replace(HARD, duration_s=1.9)
-    expected = fly(scenario, shipped_bundle)
+    expected = fly_points(scenario, shipped_bundle)
     flights = BatchedFlights([scenario], shipped_bundle)
     for [moment] in flights.moments(expected.time_s.tolist()):
         inputs = moment.inputs()
@@ -280,7 +282,9 @@ def test_who_failed_stands_still_and_does_not_count(shipped_bundle: Bundle) -> N
     for k, counted in ((0, [0, 1, 2, 3]), (1, [0, 2, 3]), (2, [2, 3]), (3, [1, 2, 3])):
         [sample] = np.flatnonzero(np.isclose(at_s, k))
         positions = FIELD_SCALE.position_to_model(paths[sample, counted])
-        assert flight.cost[k] == pytest.approx(coverage_cost(flight.importance, positions))
+        assert flight.coverage is not None
+        importance = flight.coverage.importance
+        assert flight.cost[k] == pytest.approx(coverage_cost(importance, positions))
 
 
 def test_who_comes_back_has_forgotten_what_it_saw(shipped_bundle: Bundle) -> None:

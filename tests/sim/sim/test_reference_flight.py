@@ -10,7 +10,8 @@ from edge.core.ports import OdometrySource
 from edge.core.world import GaussianFeature
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import load_bundle
-from lpac.sim.experiment import SimulatedFlight, fly, prepare
+from lpac.sim.points import cost_times_s, fly_points, prepare
+from lpac.sim.scenario import Scenario
 from lpac.sim.swarm import ClockedPac, Swarm
 from lpac.sim.vehicles import PointVehicles
 from lpac.study.study import Condition, Draw, Method, Study
@@ -40,11 +41,11 @@ def inside(positions: F64) -> F64:
     return np.clip(positions, _INSIDE, 512.0 - _INSIDE)
 
 
-def flown_in_the_library(flown: SimulatedFlight) -> F64:
+def flown_in_the_library(scenario: Scenario) -> F64:
     """The costs (C,) of the same flight there."""
     bundle = load_bundle(FIELD)
-    prepared = prepare(flown.scenario, bundle)
-    scale = flown.scenario.scale
+    prepared = prepare(scenario, bundle)
+    scale = scenario.scale
     features = [f for f in prepared.features if isinstance(f, GaussianFeature)]
     environment = reference_environment(
         features, inside(scale.position_to_model(prepared.starts_m))
@@ -66,10 +67,10 @@ def flown_in_the_library(flown: SimulatedFlight) -> F64:
         vehicles=PointVehicles(prepared.starts_m, 512.0 / scale.env_scale),
         medium=prepared.medium,
         rng=prepared.clock_rng,
-        clocks=flown.scenario.clocks,
+        clocks=scenario.clocks,
     )
     costs = []
-    for positions_m in swarm.run(flown.cost_time_s.tolist()):
+    for positions_m in swarm.run(cost_times_s(scenario.duration_s).tolist()):
         environment.SetGlobalRobotPositions(
             point_vector(inside(scale.position_to_model(positions_m)))
         )
@@ -88,9 +89,9 @@ def test_the_library_sees_about_the_same_flight() -> None:
     condition = Condition(scenario=SET_UP.scenario(loss=0.3))
     study = Study(methods=(Method.of("field", FIELD),), conditions=(condition,))
     [flight] = study.flights_of(study.methods[0], condition, Draw(102))
-    flown = fly(flight.scenario, load_bundle(FIELD))
-    costs = flown_in_the_library(flown)
+    flown = fly_points(flight.scenario, load_bundle(FIELD))
+    costs = flown_in_the_library(flight.scenario)
     np.testing.assert_allclose(flown.cost[0], costs[0], rtol=1e-3)
-    apart = np.abs(flown.normalized_cost - costs / costs[0])
+    apart = np.abs(flown.normalized - costs / costs[0])
     assert apart[:5].max() < 0.002 and apart.max() < 0.15 and apart[-1] < 0.05
     assert costs[-1] < 0.5 * costs[0]

@@ -1,6 +1,7 @@
 """A fleet of real robot nodes under a real ground, on one simulated clock."""
 
 import dataclasses
+import itertools
 import math
 import re
 import tempfile
@@ -41,15 +42,17 @@ from lpac.ground.station.protocol import (
 )
 from lpac.sim.air import GROUND
 from lpac.sim.fleet.clocked import fly_simulated
-from lpac.sim.fleet.flight import FleetFlight
+from lpac.sim.fleet.flight import FleetMoment
 from lpac.sim.fleet.layout import ORIGIN, Settings
 from lpac.sim.fleet.recorded import RecordingError
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
+from lpac.sim.points import SAMPLE_S
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon
 from lpac.sim.scenario import Scenario
+from lpac.sim.summary import summary
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE
 
@@ -573,33 +576,34 @@ class _Listener(ScriptListener):
 
 @pytest.mark.slow
 def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
-    def flown(name: str) -> FleetFlight:
-        scenario = Scenario(robots=2, seed=4, duration_s=10.0)
+    def flown(name: str) -> FlightRecord:
         return fly_simulated(scenario, tmp_path / name, SHIPPED)
 
+    scenario = Scenario(robots=2, seed=4, duration_s=10.0)
     flight, again = flown("first"), flown("again")
-    for robot, same in zip(flight.robots, again.robots, strict=True):
-        np.testing.assert_array_equal(robot.truth.position_m, same.truth.position_m)
+    for track, same in zip(flight.vehicles, again.vehicles, strict=True):
+        np.testing.assert_array_equal(track.position_m, same.position_m)
     pads_m, others_m = (
         a_fleet(tmp_path / str(seed), seed, robots=2).true_positions_m() for seed in (5, 6)
     )
     assert (pads_m != others_m).any()
-    assert flight.all_landed and flight.problem is None
-    assert [change.state for change in flight.robots[0].changes][-4:] == [
+    assert flight.all_landed and flight.script.problem is None
+    assert [change.state for change in flight.script.programs[0].changes][-4:] == [
         FlightState.MISSION, FlightState.RETURN, FlightState.LAND, FlightState.LANDED,
     ]  # fmt: skip
-    assert min(robot.mission_share for robot in flight.robots) > 0.9
-    assert flight.record.true_fence_margin_m > 0.0
-    least = flight.record.true_separation
+    assert min(map(flight.mission_share, flight.robots)) > 0.9
+    assert flight.true_fence_margin_m > 0.0
+    least = flight.true_separation
     assert least is not None and least.distance_m > DRONE_M
-    assert flight.summary() == again.summary()
-    assert [each["command"] for each in flight.summary()["commands"]] == [
+    told = summary(scenario, flight)
+    assert told == summary(scenario, again)
+    assert [each["command"] for each in told["commands"]] == [
         "origin", "again", "enable", "takeoff", "start", "return",
     ]  # fmt: skip
-    for each in flight.summary()["commands"]:
+    for each in told["commands"]:
         assert each["problem"] is None
         assert each["results"] == dict.fromkeys(("r0", "r1"), "done")
-    assert flight.record.normalized[-1] < 1.0
+    assert flight.normalized[-1] < 1.0
 
 
 def test_who_flies_is_checked_once_a_second_and_who_has_landed_more_often(
@@ -699,10 +703,28 @@ LOGGED = low_flight(2, 1, 3.0)
 SHARING = ROOT / "policies" / "field" / "field"
 
 
+def test_whoever_watches_a_fleet_may_end_its_mission(tmp_path: Path) -> None:
+    seen: list[FleetMoment] = []
+
+    def watch(moment: FleetMoment) -> None:
+        seen.append(moment)
+        if moment.step == "mission" and len(moment.statuses) == 2:
+            moment.stop()
+
+    flight = fly_simulated(low_flight(2, 1, 60.0), tmp_path, SHIPPED, watch=watch)
+    assert flight.script.problem is None and flight.all_landed
+    assert 0.0 < flight.duration_s < 3.0
+    times_s = [moment.time_s for moment in seen]
+    assert np.allclose(np.diff(times_s), SAMPLE_S) and times_s[-1] <= flight.script.began_s["end"]
+    assert [step for step, _ in itertools.groupby(moment.step for moment in seen)] == [
+        "assemble", "origin", "reset maps", "preflight", "takeoff", "start", "mission", "return",
+    ]  # fmt: skip
+
+
 class Logged(NamedTuple):
     """A flight whose robots wrote logs, and the folder that they are in."""
 
-    flight: FleetFlight
+    flight: FlightRecord
     folder: Path
 
 
@@ -717,8 +739,8 @@ def test_what_the_robots_logged_is_what_they_computed(logged: Logged) -> None:
     """Flight logs as the robots' programs write them."""
     policy = LpacPolicy(load_bundle(SHARING))
     neighbours = 0
-    for robot, record in enumerate(logged.flight.robots):
-        (log,) = record.logs
+    for robot, program in enumerate(logged.flight.script.programs):
+        (log,) = program.logs
         assert log == f"robots/{robot}/logs/robot-{robot}-0001.mcap"
         messages = list(read(logged.folder / log))
         states = {message["state"] for topic, _, message in messages if topic == "status"}
@@ -741,23 +763,24 @@ def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
     """To the last digit: `lpac report` has the logs, the flight what the robots said to them."""
     flight = logged.flight
     (reported,) = examine([logged.folder], Wanted(), lambda *_: None).records
-    told, summary = Examined((reported,), ()).summary()["trials"][0], flight.summary()
+    told = Examined((reported,), ()).summary()["trials"][0]
+    said = summary(LOGGED, flight)
     for cost, truly in ((told["cost"], "cost"), (told["truth"]["cost"], "true_cost")):
         assert 0.0 < cost["final"] != cost["initial"]
         assert [cost[key] for key in ("initial", "final", "normalized")] == [
-            summary[truly][key] for key in ("initial", "final", "final_normalized")
+            said[truly][key] for key in ("initial", "final", "final_normalized")
         ]
-    assert told["cost"]["curve"] == summary["cost_curve"]["normalized_cost"]
+    assert told["cost"]["curve"] == said["cost_curve"]["normalized_cost"]
     for key in (
         "duration_s", "curve_time_s", "cost", "true_cost", "lloyd", "separation", "true_separation",
         "fence_margin_m", "true_fence_margin_m",
     ):  # fmt: skip
-        np.testing.assert_equal(getattr(reported, key), getattr(flight.record, key), key)
-    assert told["fence_margin_m"] == summary["fence"]["margin_m"] is not None
-    assert told["truth"]["fence_margin_m"] == summary["fence"]["true_margin_m"] is not None
-    assert told["truth"]["separation"]["distance_m"] == summary["separation"]["distance_m"]
+        np.testing.assert_equal(getattr(reported, key), getattr(flight, key), key)
+    assert told["fence_margin_m"] == said["fence"]["margin_m"] is not None
+    assert told["truth"]["fence_margin_m"] == said["fence"]["true_margin_m"] is not None
+    assert told["truth"]["separation"]["distance_m"] == said["separation"]["distance_m"]
     for robot, flown in zip(reported.robots, flight.robots, strict=True):
-        assert reported.mission_share(robot) == flown.mission_share > 0.5
+        assert reported.mission_share(robot) == flight.mission_share(flown) > 0.5
 
 
 @pytest.mark.slow
@@ -767,9 +790,9 @@ def test_flights_beside_each_other_are_told_apart(tmp_path: Path, logged: Logged
     flown = [logged.flight, longer]
     both = examine([logged.folder, tmp_path], Wanted(), lambda *_: None)
     reported = sorted(both.records, key=_duration_s)
-    assert [_duration_s(r) for r in reported] == [_duration_s(f.record) for f in flown]
+    assert [_duration_s(r) for r in reported] == [_duration_s(f) for f in flown]
     for record, flight in zip(reported, flown, strict=True):
-        np.testing.assert_equal(record.normalized, flight.record.normalized)
+        np.testing.assert_equal(record.normalized, flight.normalized)
 
 
 def _duration_s(record: FlightRecord) -> float:
@@ -785,11 +808,10 @@ def test_recorded_steps_of_the_policy_are_the_same_flight(
     monkeypatch.setattr(LpacPolicy, "velocity", lambda *inputs: velocity(*inputs) * 1.01)
     other = fly_simulated(LOGGED, tmp_path / "other", SHARING)
     again = fly_simulated(LOGGED, tmp_path / "again", SHARING, recorded=logged.folder)
-    for robot, first in zip(again.robots, logged.flight.robots, strict=True):
-        np.testing.assert_array_equal(robot.truth.position_m, first.truth.position_m)
-    assert not any(robot.logs for robot in (*other.robots, *again.robots))
-    assert again.summary()["cost_curve"] == logged.flight.summary()["cost_curve"]
-    assert other.summary()["cost_curve"] != logged.flight.summary()["cost_curve"]
+    for track, first in zip(again.vehicles, logged.flight.vehicles, strict=True):
+        np.testing.assert_array_equal(track.position_m, first.position_m)
+    assert not any(each.logs for each in (*other.script.programs, *again.script.programs))
+    assert again.cost.tolist() == logged.flight.cost.tolist() != other.cost.tolist()
 
 
 def test_records_of_another_flight_are_refused(tmp_path: Path, logged: Logged) -> None:
@@ -803,6 +825,6 @@ def test_records_of_another_flight_are_refused(tmp_path: Path, logged: Logged) -
     two = tmp_path / "two"
     for number in (1, 2):
         flight = fly_simulated(low_flight(1, 1, 2.0), two, SHARING, logs=True)
-        assert flight.robots[0].logs == (f"robots/0/logs/robot-0-000{number}.mcap",)
+        assert flight.script.programs[0].logs == (f"robots/0/logs/robot-0-000{number}.mcap",)
     with pytest.raises(RecordingError, match="holds logs of more than one flight"):
         recorded(low_flight(1, 1, 2.0), two)

@@ -143,7 +143,7 @@ def test_command_writes_a_bundle_that_verifies(tmp_path: Path) -> None:
         assert bundle.manifest.perception == PerceptionParameters(512, 256, 64, 256.0)
         assert all(check.passed for check in LpacPolicy(bundle).verify())
         assert bundle.id in result.output
-        assert "L = 2, K = 1, features 10 -> 16 -> 16" in result.output
+        assert "L = 2 layers (10 -> 16 -> 16), K = 1 hops" in result.output
 
 
 def test_a_checkpoint_of_five_images_sees_what_was_explored(tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_a_checkpoint_of_five_images_sees_what_was_explored(tmp_path: Path) -> N
 def test_authors_taps_give_a_bundle_without_perception(authors_taps: Path, tmp_path: Path) -> None:
     result = run(*(authors_taps, "--params", POLICIES / f"{NAME}.toml", "-o", tmp_path / "bundle"))
     assert result.exit_code == 0, result.output
-    assert "none: this checkpoint has no CNN" in result.output
+    assert "none: graph neural network and action only" in result.output
     manifest = load_bundle(tmp_path / "bundle").manifest
     assert manifest.name == authors_taps.name
     assert manifest.perception is None

@@ -21,7 +21,7 @@ from lpac.cli.options import DEFAULT_BUNDLE, VehicleKind
 from lpac.cli.paper import asynchrony, e1, e2, e3, transfer
 from lpac.paper.logged import LOGS
 from lpac.paper.network import network_report
-from lpac.sim.experiment import fly
+from lpac.sim.points import fly_points
 from lpac.sim.scenario import Scenario
 from lpac.study.study import BASELINES
 
@@ -40,13 +40,13 @@ def said(time_s: float, bundle_id: str) -> LoggedStatus:
 def mission() -> FlightRecord:
     """Of two robots, as logs have it."""
     bundle = load_bundle(DEFAULT_BUNDLE)
-    flight = fly(Scenario(robots=2, duration_s=5.0), bundle)
-    record, coverage = flight.record, flight.record.coverage
+    record = fly_points(Scenario(robots=2, duration_s=5.0), bundle)
+    coverage = record.coverage
     assert coverage is not None
     robots = tuple(
         replace(r, said=tuple(said(t, bundle.id) for t in r.time_s.tolist())) for r in record.robots
     )
-    read = Coverage(coverage.importance, coverage.cells_per_m, flight.features)
+    read = Coverage(coverage.importance, coverage.cells_per_m, record.features)
     return replace(record, name="paper-1", robots=robots, coverage=read)
 
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from edge.core.fence import Fence
+from lpac.analysis.flight import FaultRecord, FlightRecord, GivenOrder
+from lpac.analysis.truth import TrueTrack
 from lpac.sim.drill.bounds import (
     POSITION_ERROR_M,
     AllDown,
@@ -47,15 +49,16 @@ from lpac.sim.drill.bounds import (
     always,
 )
 from lpac.sim.drill.faults import FAULTS, Fault
-from lpac.sim.drill.truth import FlightTruth, GivenOrder, VehicleTruth
+from lpac.sim.drill.field import ON_GROUND_BELOW_M
 from lpac.sim.px4.modes import Px4Mode
 
 FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 25.0)
 TIMES_S = np.arange(0.0, 60.0, 0.04)
+ORDERS = (GivenOrder("takeoff", (0, 1), 4.0, 12.0),)
 TAKEOFF_S, FAULT_S, LAND_S, DOWN_S = 5.0, 20.0, 40.0, 50.0
 
 
-def a_vehicle(pad_m: tuple[float, float], height_m: float) -> VehicleTruth:
+def a_vehicle(pad_m: tuple[float, float], height_m: float) -> TrueTrack:
     """Up at 5 s, a mission at 1 m/s along x from 20 s to 40 s, down by 50 s."""
     t = TIMES_S
     x_m = pad_m[0] + np.clip(t - FAULT_S, 0.0, LAND_S - FAULT_S) * 0.2
@@ -64,13 +67,13 @@ def a_vehicle(pad_m: tuple[float, float], height_m: float) -> VehicleTruth:
     position_m = np.stack([x_m, np.full_like(t, pad_m[1]), z_m], axis=1)
     armed = (t >= TAKEOFF_S) & (t < DOWN_S)
     mode = np.where(t < LAND_S, Px4Mode.OFFBOARD, Px4Mode.LAND)
-    return VehicleTruth(
+    return TrueTrack(
         time_s=t,
         position_m=position_m,
+        airborne=z_m > ON_GROUND_BELOW_M,
         velocity_m_s=np.gradient(position_m, 0.04, axis=0),
         mode=np.where(armed, mode, Px4Mode.HOLD),
         armed=armed,
-        landed=z_m <= 0.0,
         setpoint_at_s=np.where(armed, np.minimum(np.floor(t * 10.0) / 10.0, LAND_S), -math.inf),
         is_velocity=(t >= 10.0) & (t < LAND_S),
         velocity_error_m_s=np.zeros_like(t),
@@ -78,20 +81,28 @@ def a_vehicle(pad_m: tuple[float, float], height_m: float) -> VehicleTruth:
     )
 
 
-def a_flight(**changes: Any) -> FlightTruth:
-    vehicles = (a_vehicle((5.0, 5.0), 5.0), a_vehicle((15.0, 15.0), 9.5))
-    flight = FlightTruth(
-        vehicles=vehicles, hit=(0,), fault_s=FAULT_S, calm_s=LAND_S, marks={"later": 30.0},
-        orders=(GivenOrder("takeoff", (0, 1), 4.0, 12.0),), fence=FENCE,
-        pads_m=np.array([[5.0, 5.0], [15.0, 15.0]]), drone_m=0.5,
+def flight_of(*vehicles: TrueTrack, orders: tuple[GivenOrder, ...] = ORDERS) -> FlightRecord:
+    return FlightRecord(
+        name="drill", duration_s=0.0, from_s=0.0, to_s=60.0, robots=(), coverage=None,
+        sensor_size=64, cost_time_s=np.zeros(0), fence=FENCE,
+        truth={str(robot): vehicle for robot, vehicle in enumerate(vehicles)},
+        fault=FaultRecord(
+            hit=(0,), begin_s=FAULT_S, marks={"later": 30.0}, orders=orders,
+            pads_m=np.array([[5.0, 5.0], [15.0, 15.0]]), drone_m=0.5,
+        ),
     )  # fmt: skip
-    return replace(flight, **changes)
 
 
-def changed(flight: FlightTruth, **fields: Any) -> FlightTruth:
+def moved(vehicle: TrueTrack, **fields: Any) -> TrueTrack:
+    """The same, but for these fields."""
+    moved = replace(vehicle, **fields)
+    return replace(moved, airborne=moved.position_m[:, 2] > ON_GROUND_BELOW_M)
+
+
+def changed(flight: FlightRecord, **fields: Any) -> FlightRecord:
     """The same, but for what the first vehicle did."""
     first, *others = flight.vehicles
-    return replace(flight, vehicles=(replace(first, **fields), *others))
+    return flight_of(moved(first, **fields), *others)
 
 
 def after(begin_s: float, value: Any, otherwise: Any, end_s: float = math.inf) -> Any:
@@ -101,33 +112,21 @@ def after(begin_s: float, value: Any, otherwise: Any, end_s: float = math.inf) -
     return np.where(chosen, value, otherwise)
 
 
-WELL = a_flight()
-FIRST = WELL.vehicles[0]
-FLOWN_M, BESIDE_M = FIRST.position_m, WELL.vehicles[1].position_m
-AT_REST = replace(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
-STANDS = replace(WELL, vehicles=(AT_REST, WELL.vehicles[1]))
-NEAR = replace(
-    STANDS,
-    vehicles=(AT_REST, replace(WELL.vehicles[1], position_m=BESIDE_M - (8.0, 8.0, 0.0))),
-)
+FIRST, SECOND = a_vehicle((5.0, 5.0), 5.0), a_vehicle((15.0, 15.0), 9.5)
+WELL = flight_of(FIRST, SECOND)
+FLOWN_M, BESIDE_M = FIRST.position_m, SECOND.position_m
+AT_REST = moved(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
+STANDS = flight_of(AT_REST, SECOND)
+NEAR = flight_of(AT_REST, moved(SECOND, position_m=BESIDE_M - (8.0, 8.0, 0.0)))
 # The second lands 8.5 m from its pad.
-BESIDE = replace(
-    WELL,
-    vehicles=(
-        FIRST,
-        replace(
-            WELL.vehicles[1],
-            position_m=after(45.0, (15.0, 23.5, 0.0), WELL.vehicles[1].position_m),
-        ),
-    ),
-)
+BESIDE = flight_of(FIRST, moved(SECOND, position_m=after(45.0, (15.0, 23.5, 0.0), BESIDE_M)))
 STANDS_STILL = changed(WELL, position_m=after(FAULT_S, (5.0, 5.0, 5.0), FLOWN_M))
 DRIFTS_M_S = after(25.0, (0.9, 0.0, 0.0), FLOWN_M * 0.0, 26.0)
 PILOTED = after(25.0, Px4Mode.POSCTL, FIRST.mode, 30.0)
 SILENT_S = np.minimum(FIRST.setpoint_at_s, FAULT_S)
 
 # A bound, a flight that keeps it, and one that breaks it.
-CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
+CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
     (Apart(), WELL, changed(WELL, position_m=after(30.0, BESIDE_M + 0.2, FLOWN_M, 30.1))),
     (
         # The one comes down where the other stands, which has landed.
@@ -140,7 +139,7 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
     (
         InsideFence(whose="others"),
         changed(WELL, position_m=after(30.0, (-20.0, 5.0, 5.0), FLOWN_M, 31.0)),
-        replace(WELL, vehicles=(FIRST, replace(FIRST, position_m=FLOWN_M - (30.0, 0.0, 0.0)))),
+        flight_of(FIRST, moved(FIRST, position_m=FLOWN_M - (30.0, 0.0, 0.0))),
     ),
     (
         InsideFence(25.0, "hit"),
@@ -164,9 +163,10 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
     (NoUnorderedStart(), WELL, changed(WELL, armed=after(8.0, False, FIRST.armed, 9.0))),
     (
         NobodyFalls(),
-        replace(
-            changed(WELL, armed=FIRST.armed & (TIMES_S < 45.0)),
-            orders=(*WELL.orders, GivenOrder("kill", (0,), 44.9, 45.0)),
+        flight_of(
+            moved(FIRST, armed=FIRST.armed & (TIMES_S < 45.0)),
+            SECOND,
+            orders=(*ORDERS, GivenOrder("kill", (0,), 44.9, 45.0)),
         ),
         changed(WELL, armed=FIRST.armed & (TIMES_S < 45.0)),
     ),
@@ -183,11 +183,11 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
         changed(WELL, position_m=after(30.0, BESIDE_M + 2.0, FLOWN_M, 30.1)),
     ),
     (BelowCeiling(), WELL, changed(WELL, position_m=after(30.0, (5.0, 5.0, 30.0), FLOWN_M, 31.0))),
-    (NoUnorderedStart(), WELL, replace(WELL, orders=())),
+    (NoUnorderedStart(), WELL, flight_of(FIRST, SECOND, orders=())),
     (
         NoUnorderedStart(),
         WELL,
-        replace(WELL, orders=(GivenOrder("takeoff", (1,), 4.0, 12.0),)),
+        flight_of(FIRST, SECOND, orders=(GivenOrder("takeoff", (1,), 4.0, 12.0),)),
     ),
     (
         PilotIsAlone(),
@@ -262,7 +262,7 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
     ("bound", "kept", "broken"), CASES, ids=[f"{type(case[0]).__name__}" for case in CASES]
 )
 def test_a_bound_sees_what_it_is_for(
-    bound: Criterion, kept: FlightTruth, broken: FlightTruth
+    bound: Criterion, kept: FlightRecord, broken: FlightRecord
 ) -> None:
     assert not bound.figure(kept).broken, bound.figure(kept)
     assert bound.figure(broken).broken, bound.figure(broken)
@@ -287,7 +287,7 @@ def test_who_is_to_hold_and_lands_instead_breaks_a_promise(fault: Fault) -> None
     )
     # Soon after the fault, and softly.
     landed = tuple(replace(v, mode=after(FAULT_S + 3.0, Px4Mode.LAND, v.mode)) for v in held)
-    one = replace(STANDS, vehicles=landed)
+    one = flight_of(*landed)
     waits = [bound for bound in fault.bounds if isinstance(bound, NotLandedBefore)]
     assert any(bound.figure(one).broken for bound in waits)
 

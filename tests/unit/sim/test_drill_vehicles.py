@@ -6,13 +6,14 @@ import re
 import numpy as np
 import pytest
 
+from lpac.analysis.flight import FaultRecord, FlightRecord
+from lpac.analysis.truth import TrueTrack
 from lpac.sim.description import ERRORS, fence_around
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.field import supports
 from lpac.sim.drill.outcome import LATE_S, outcome_of
 from lpac.sim.drill.processes import MAVLINK, PX4
 from lpac.sim.drill.simulated import SUPPORTED
-from lpac.sim.drill.truth import FlightTruth, VehicleTruth
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT
 
@@ -39,24 +40,26 @@ def test_hazards_are_shown_by_faults_that_exist() -> None:
     assert len(named) > 20 and set(named) <= set(FAULTS)
 
 
-def never_down(late_s: float) -> FlightTruth:
+def never_down(late_s: float) -> FlightRecord:
     """A flight that ends in the air."""
     count = 3
-    vehicle = VehicleTruth(
+    vehicle = TrueTrack(
         time_s=np.array([0.0, 0.04, 0.08]),
         position_m=np.full((count, 3), 8.0),
+        airborne=np.ones(count, np.bool_),
         velocity_m_s=np.zeros((count, 3)),
         mode=np.full(count, Px4Mode.OFFBOARD),
         armed=np.ones(count, np.bool_),
-        landed=np.zeros(count, np.bool_),
         setpoint_at_s=np.full(count, -math.inf),
         is_velocity=np.zeros(count, np.bool_),
         velocity_error_m_s=np.zeros(count),
         commands=np.zeros(count, np.int64),
     )
-    return FlightTruth(
-        (vehicle,), (), 0.0, 0.0, {}, (), fence_around(32.0, 1, ERRORS), np.zeros((1, 2)), 0.5,
-        late_s,
+    return FlightRecord(
+        name="drill", duration_s=0.0, from_s=0.0, to_s=0.08, robots=(), coverage=None,
+        sensor_size=64, cost_time_s=np.zeros(0), truth={"r0": vehicle},
+        fence=fence_around(32.0, 1, ERRORS),
+        fault=FaultRecord(begin_s=0.0, pads_m=np.zeros((1, 2)), drone_m=0.5, late_s=late_s),
     )  # fmt: skip
 
 

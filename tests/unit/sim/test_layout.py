@@ -10,8 +10,8 @@ from edge.core.world import parse_world
 from edge.flight.margins import places_apart
 from edge.policy.bundle import Bundle
 from lpac.sim.description import ERRORS
-from lpac.sim.experiment import fly
 from lpac.sim.fleet.layout import Layout
+from lpac.sim.points import fly_points
 from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 
@@ -47,7 +47,7 @@ def test_a_seed_has_the_world_of_the_swarm_in_simulated_time(
     tmp_path: Path, shipped_bundle: Bundle
 ) -> None:
     layout = Layout(Scenario(robots=1, seed=11), SHIPPED)
-    swarm = fly(Scenario(robots=1, seed=11, duration_s=0.1), shipped_bundle)
+    swarm = fly_points(Scenario(robots=1, seed=11, duration_s=0.1), shipped_bundle)
     assert layout.features == swarm.features
     r0 = {"zenoh_port": 7447, "system_id": 1, "mavlink_url": "udpin://127.0.0.1:14551"}
     layout.write(tmp_path, "a-fleet", {"r0": r0})

@@ -1,13 +1,16 @@
 """What is said of how many robots a machine carries."""
 
+from types import SimpleNamespace
+
 import pytest
 from typer.testing import CliRunner
 
-from lpac.cli import programs
+from lpac.analysis.flight import ScriptRecord
 from lpac.cli import sim as cli
 from lpac.cli.programs import as_many_as_carried, say_if_carried
 from lpac.sim.fleet import load
 from lpac.sim.fleet.processes import Backlog, OverloadError
+from lpac.sim.scenario import Scenario
 from tests.conftest import SHIPPED
 
 # Units of work a second, measured: two cores of a small cloud machine, which flew ten robots with
@@ -43,11 +46,15 @@ def test_programs_fly_as_many_as_the_machine_carries_unless_it_is_said_how_many(
     monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], robots: int
 ) -> None:
     flown: list[int] = []
+
+    def fly(scenario: Scenario, *_: object) -> SimpleNamespace:
+        flown.append(scenario.robots)
+        return SimpleNamespace(script=ScriptRecord())
+
     monkeypatch.setattr(load, "_units_per_s", lambda _: FIVE_FLEW)
-    monkeypatch.setattr(cli, "_fly_on_clock", lambda scenario, _: flown.append(scenario.robots))
-    monkeypatch.setattr(cli, "_show_fleet_flight", lambda *_: None)
-    for fly in ("fly_script", "serve"):
-        monkeypatch.setattr(programs, fly, lambda of: flown.append(of.scenario.robots))
+    monkeypatch.setattr(cli, "_show", lambda *_: None)
+    for name in ("_fly_on_clock", "_fly_programs", "_serve"):
+        monkeypatch.setattr(cli, name, fly)
     result = CliRunner().invoke(cli.app, options)
     assert (result.exit_code, flown) == (0, [robots]), result.output
 

@@ -7,11 +7,11 @@ import pytest
 
 from edge.core.frames import ModelScale
 from edge.policy.bundle import load_bundle
-from lpac.sim.experiment import prepare
 from lpac.sim.failure import Failure
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.layout import Layout
 from lpac.sim.fleet.processes import Fleet
+from lpac.sim.points import prepare
 from lpac.sim.scenario import Scenario
 from lpac.sim.ticks import Clocks
 from tests.conftest import SHIPPED

@@ -13,8 +13,9 @@ from lpac.sim.cores import Outcome, in_this_process
 from lpac.sim.drill.bounds import Figure
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.outcome import FlightOutcome
+from lpac.sim.engines import flies
 from lpac.study.drill_report import as_junit, report_of
-from lpac.study.drills import Drill, flies, outcomes_of, read_drill
+from lpac.study.drills import Drill, outcomes_of, read_drill
 from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight
 from tests.conftest import ROOT, SHIPPED
 
@@ -33,7 +34,7 @@ def outcome_of(flight: PlannedFlight) -> FlightOutcome:
 
 def test_without_names_all_faults_of_the_engine_are_flown() -> None:
     for engine in ("simulated", "mavlink"):
-        flown = {flight.fault for flight in Drill(engine=engine).flights()}
+        flown = {flight.scenario.fault for flight in Drill(engine=engine).flights()}
         assert flown == {name for name, fault in FAULTS.items() if flies(engine, fault)}
     assert len(Drill(engine="mavlink").flights()) < len(Drill().flights()) == len(FAULTS)
 
@@ -41,7 +42,7 @@ def test_without_names_all_faults_of_the_engine_are_flown() -> None:
 def test_flights_that_share_their_begin_are_beside_each_other() -> None:
     """So that each process makes it once for all of them."""
     flights = Drill(seeds=2).flights()
-    begins = [(flight.scenario, FAULTS[flight.fault].settings) for flight in flights]
+    begins = [(flight.scenario, FAULTS[flight.scenario.fault].settings) for flight in flights]
     changes = sum(a != b for a, b in itertools.pairwise(begins))
     assert changes == len(dict.fromkeys(begins)) - 1
     assert len({flight.key for flight in flights}) == 2 * len(FAULTS)
@@ -104,7 +105,7 @@ def test_a_report_says_what_broke_and_how_it_is_flown_again(tmp_path: Path) -> N
 
 def test_a_drill_is_a_file(tmp_path: Path) -> None:
     drill = read_drill(ROOT / "examples" / "drill.toml")
-    assert {flight.fault for flight in drill.flights()} == set(drill.faults)
+    assert {flight.scenario.fault for flight in drill.flights()} == set(drill.faults)
     file = tmp_path / "mine.toml"
     file.write_text(f'faults = []\nseeds = 3\nbundle = "{SHIPPED}"\n')
     assert len(read_drill(file).flights()) == 3 * len(FAULTS)

@@ -9,6 +9,7 @@ import pytest
 
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.failure import Failure, LostRobots
+from lpac.sim.scenario import Scenario
 from lpac.study.flights import CLAIRVOYANT, CostCurve, PlannedFlight
 from lpac.study.results import as_json, results_of, verdict_of, worst_worlds
 from lpac.study.study import Condition, Method, Study, TrainedBundle
@@ -25,6 +26,7 @@ TIMES = FIELD.scenario(duration_s=40.0)
 PLAIN = Condition(scenario=TIMES)
 LOSSY = Condition(scenario=replace(TIMES, loss=0.3))
 EIGHT = Condition(scenario=TIMES, lost=LostRobots(2, 20.0))
+LANDED = FIELD.scenario(fault="landed")
 STUDY = Study(
     methods=(ONE, THREE, RIVAL, Method(name=CLAIRVOYANT)),
     conditions=(PLAIN, LOSSY, EIGHT),
@@ -134,6 +136,14 @@ def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:
             {"conditions": (Condition(engine="simulated", lost=LostRobots(2, 20.0)),)},
             "lost, from_pads: are of points alone",
         ),
+        (
+            {
+                "conditions": (
+                    Condition(scenario=FIELD.scenario(fault="landed"), engine="simulated"),
+                )
+            },
+            "fault = landed: no cost is judged under a fault",
+        ),
         ({"conditions": (Condition(engine="px4"),)}, "engine = 'px4': needs PX4's build folder"),
         ({"conditions": (Condition(methods=("two",)),)}, "methods = 'two': must be one of one, "),
         ({"receiver_error_m": (5.0, 1.0)}, "receiver_error_m = .*: must be .least, greatest."),
@@ -147,6 +157,7 @@ def test_a_study_that_cannot_be(change: dict[str, object], text: str) -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
+        ({"scenario": Scenario()}, "world_size, communication_range: must be given"),
         ({"lost": LostRobots(2, 60.0)}, "must be in flight"),
         (
             {"scenario": SET_UPS["n1"].scenario(), "lost": LostRobots(1, 20.0)},

@@ -1,9 +1,9 @@
-"""One simulated flight: who flies what, over which world; and what came out."""
+"""One flight of points: what it begins with, and how it goes on."""
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -25,76 +25,6 @@ from lpac.sim.vehicles import PointVehicles
 
 SAMPLE_S = 0.2
 SAMPLES_PER_COST = 5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SimulatedFlight:
-    """What a simulated flight was like; times in s, positions in m of the mission frame.
-
-    `time_s` (T,) and `positions_m` (T, N, 2) sample the flight; `cost` (C,) is the coverage cost J
-    at fewer of these times, from the start to the end. `messages` counts what became of them;
-    `largest_payload` is the largest number in one, by its absolute value.
-    """
-
-    scenario: Scenario
-    bundle_id: str
-    perception: PerceptionParameters
-    features: tuple[Feature, ...]
-    record: FlightRecord
-    time_s: F64
-    positions_m: F64
-    cost: F64
-    messages: dict[str, int]
-    largest_payload: float
-
-    @property
-    def importance(self) -> F32:
-        """The world that was covered."""
-        assert self.record.coverage is not None
-        return self.record.coverage.importance
-
-    @property
-    def cost_time_s(self) -> F64:
-        """(C,): when `cost` was so."""
-        return self.record.cost_time_s
-
-    @property
-    def normalized_cost(self) -> F64:
-        """Cost (C,) over the initial cost; all 0 over a world without importance."""
-        return self.cost / self.cost[0] if self.cost[0] > 0.0 else np.zeros_like(self.cost)
-
-    def summary(self) -> dict[str, Any]:
-        """The flight as JSON-ready values; nothing in it depends on the machine's speed."""
-        scenario = self.scenario
-        link, radio = scenario.link, scenario.radio
-        return {
-            "controller": scenario.controller,
-            "bundle_id": self.bundle_id,
-            "robots": scenario.robots,
-            "seed": scenario.seed,
-            "duration_s": scenario.duration_s,
-            "scale": {
-                "env_scale": scenario.scale.env_scale,
-                "velocity_scale": scenario.scale.velocity_scale,
-            },
-            "link": {
-                "loss": link.loss,
-                "delay_s": link.delay_s,
-                "by_model": None if radio is None else asdict(radio),
-                "max_message_age_s": scenario.max_message_age_s,
-            },
-            "messages": self.messages,
-            "cost": {
-                "initial": self.cost[0],
-                "final": self.cost[-1],
-                "final_normalized": self.normalized_cost[-1],
-            },
-            "cost_curve": {
-                "time_s": self.cost_time_s.tolist(),
-                "normalized_cost": self.normalized_cost.tolist(),
-            },
-            "final_positions_m": self.positions_m[-1].tolist(),
-        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,22 +58,38 @@ class Preparation:
             times_s=[each for each in self.times_s if each <= time_s],
         )
 
-    def flight(
-        self, positions_m: F64, messages: dict[str, int], largest_payload: float
-    ) -> SimulatedFlight:
-        """What came out, with true positions (T, N, 2) at `times_s`."""
-        time_s = np.array(self.times_s)
-        record = _record(self.scenario, self.perception, self.importance, time_s, positions_m)
-        return SimulatedFlight(
-            scenario=self.scenario,
+    def record(
+        self, positions_m: F64, message_counts: dict[str, int], largest_payload: float
+    ) -> FlightRecord:
+        """What came out, with true positions (T, N, 2) at `times_s`.
+
+        Points are in the air from the first to the last, unless they failed, and say nothing.
+        """
+        scenario, time_s = self.scenario, np.array(self.times_s)
+        heights_m = np.zeros(len(time_s))
+        alive = np.array([alive_at(scenario.robots, scenario.failures, t) for t in self.times_s])
+        return FlightRecord(
+            name=scenario.controller,
+            duration_s=scenario.duration_s,
+            from_s=0.0,
+            to_s=scenario.duration_s,
+            robots=tuple(
+                RobotRecord(
+                    robot_id=robot,
+                    name=str(robot),
+                    time_s=time_s,
+                    position_m=np.column_stack([positions_m[:, robot], heights_m]),
+                    flying=alive[:, robot],
+                )
+                for robot in range(scenario.robots)
+            ),
+            coverage=Coverage(self.importance, scenario.scale.env_scale),
+            sensor_size=self.perception.sensor_size,
+            cost_time_s=cost_times_s(scenario.duration_s),
+            rates=LoopRates(1.0 / scenario.clocks.perception_s, 1.0 / scenario.clocks.policy_s),
             bundle_id=self.bundle.id,
-            perception=self.perception,
             features=self.features,
-            record=record,
-            time_s=time_s,
-            positions_m=positions_m,
-            cost=record.cost,
-            messages=messages,
+            message_counts=message_counts,
             largest_payload=largest_payload,
         )
 
@@ -197,7 +143,7 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
 def require_points(scenario: Scenario) -> None:
     """Raise ValueError for what points cannot do."""
     scenario.require_default(
-        "points", "errors", "wind_m_s", "budget", "sensor", "secure", "transport"
+        "points", "errors", "wind_m_s", "budget", "sensor", "secure", "transport", "fault"
     )
 
 
@@ -280,6 +226,7 @@ class WorldMoment:
 class FlightMoment(WorldMoment):
     """What a flight's watcher is shown."""
 
+    step = "mission"
     stopped = False
 
     def stop(self) -> None:
@@ -290,7 +237,7 @@ class FlightMoment(WorldMoment):
 Watch = Callable[[FlightMoment], object]
 
 
-def fly(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -> SimulatedFlight:
+def fly_points(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -> FlightRecord:
     """Simulate `scenario`; `bundle` flies it, or gives a baseline the sizes of its perception.
 
     `watch` is called at each sample, every `SAMPLE_S` from 0 to the end, and may stop the flight.
@@ -338,39 +285,7 @@ def fly(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -> Simul
         if moment.stopped:
             prepared = prepared.until(time_s)
             break
-    return prepared.flight(np.array(positions), swarm.message_counts(), swarm.largest_payload)
-
-
-def _record(
-    scenario: Scenario,
-    perception: PerceptionParameters,
-    importance: F32,
-    time_s: F64,
-    positions_m: F64,
-) -> FlightRecord:
-    """Points are in the air from the first to the last, unless they failed, and say nothing."""
-    heights_m = np.zeros(len(time_s))
-    alive = np.array([alive_at(scenario.robots, scenario.failures, t) for t in time_s.tolist()])
-    return FlightRecord(
-        name=scenario.controller,
-        duration_s=scenario.duration_s,
-        from_s=0.0,
-        to_s=scenario.duration_s,
-        robots=tuple(
-            RobotRecord(
-                robot_id=robot,
-                name=str(robot),
-                time_s=time_s,
-                position_m=np.column_stack([positions_m[:, robot], heights_m]),
-                flying=alive[:, robot],
-            )
-            for robot in range(scenario.robots)
-        ),
-        coverage=Coverage(importance, scenario.scale.env_scale),
-        sensor_size=perception.sensor_size,
-        cost_time_s=cost_times_s(scenario.duration_s),
-        rates=LoopRates(1.0 / scenario.clocks.perception_s, 1.0 / scenario.clocks.policy_s),
-    )
+    return prepared.record(np.array(positions), swarm.message_counts(), swarm.largest_payload)
 
 
 def cost_times_s(duration_s: float) -> F64:
