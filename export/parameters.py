@@ -1,13 +1,12 @@
 """The parameters that a policy was trained with, from our TOML file or CoverageControl's."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from edge.core.file_errors import in_words
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import Bounded, ConfigError, Positive, from_mapping
+from edge.core.toml import read_toml
 from edge.core.wire import FLOAT_PAYLOADS, PayloadType
 from edge.policy.bundle import Training
 
@@ -35,14 +34,7 @@ def read_parameters(path: Path) -> PolicyParameters:
 
     Raises ConfigError that names the file and the line or key.
     """
-    try:
-        document = tomllib.loads(path.read_text("utf-8-sig"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {in_words(error)}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text, expected TOML") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: is not TOML: {error}") from None
+    document = read_toml(path)
     environment = document.get("Environment")
     if isinstance(environment, Mapping) and "Maps" in environment:
         document = _from_coverage_control(_TableReader(document, path))

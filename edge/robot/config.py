@@ -5,7 +5,6 @@ the key, the value and what is allowed.
 """
 
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,6 @@ from edge.core.address import (
     require_host,
 )
 from edge.core.fence import Fence
-from edge.core.file_errors import in_words
 from edge.core.frames import ModelScale
 from edge.core.position import PositionLimits
 from edge.core.schema import (
@@ -33,6 +31,7 @@ from edge.core.schema import (
     Positive,
     from_mapping,
 )
+from edge.core.toml import read_toml
 from edge.core.wire import PAYLOAD_TYPES, PayloadType
 from edge.flight.energy import EnergyParameters
 from edge.flight.failsafe import required
@@ -337,12 +336,7 @@ class RobotConfig(Bounded):
 
 def load_config(path: Path) -> RobotConfig:
     """The configuration in the file, its paths made absolute. Raises ConfigError."""
-    try:
-        mapping = tomllib.loads(path.read_text("utf-8-sig"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: no TOML: {error}") from None
+    mapping = read_toml(path)
     folder = path.resolve().parent
     for table, key in (
         ("policy", "bundle"), ("policy", "world"), ("log", "folder"), ("identity", "folder"),

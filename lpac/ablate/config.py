@@ -7,7 +7,6 @@ the rounds instead of the policy.
 
 import json
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -15,9 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edge.core.schema import ConfigError, from_mapping
+from edge.core.toml import read_toml
 from lpac.study.file import condition_of, merged
 from lpac.study.study import Condition
-from lpac.train.config import ReadConfig, TrainingConfig, config_of, read_toml, require_name
+from lpac.train.config import ReadConfig, TrainingConfig, config_of, require_name
 
 BASE = "base"
 # Keys of a training that no variant changes: how much is computed, and what the task is.
@@ -130,10 +130,10 @@ class Ablation:
 
 def read_ablation(path: Path) -> Ablation:
     """Raises ConfigError that names the file, the line or key, the value and what is allowed."""
-    config = from_mapping(AblationConfig, tomllib.loads(read_toml(path)), str(path))
+    config = from_mapping(AblationConfig, read_toml(path), str(path))
     _require_no_names(config.train, str(path))
     base_path = path.parent / config.base
-    document = merged(tomllib.loads(read_toml(base_path)), config.train)
+    document = merged(read_toml(base_path), config.train)
     where = f"{path}: {BASE}"
     base = PlannedVariant(
         BASE,

@@ -46,7 +46,8 @@ def study(
     ] = None,
 ) -> None:
     """Fly an experiment of yours, from a TOML file: policies over worlds, or faults in flight."""
-    from lpac.study.file import read_study, read_toml
+    from edge.core.toml import read_toml
+    from lpac.study.file import read_study
 
     if "faults" in read_toml(file):
         from lpac.cli.drill import fly_faults

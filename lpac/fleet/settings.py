@@ -8,7 +8,6 @@ user's. Every mistake is one line that names the file, the key, the robot and wh
 import itertools
 import math
 import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,8 +16,8 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from edge.core.address import host_and_port, ipv4, is_loopback_endpoint, require_host, same_host
-from edge.core.file_errors import in_words
 from edge.core.schema import Bounded, ConfigError, PointXY, from_mapping
+from edge.core.toml import parse_toml, read_toml_text
 from edge.flight.margins import Margin, places_apart
 from edge.messages.bounds import RobotId
 from edge.messages.mission import SlotNumber
@@ -359,25 +358,16 @@ class FleetTable(Bounded):
 
 def read_fleet(path: Path) -> str:
     """The file's text, its ends of lines as they are. Raises ConfigError."""
-    try:
-        # Not read_text, which would change them.
-        return path.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError as error:
+    if not path.exists():
         raise ConfigError(
-            f"{path}: cannot be read: {in_words(error)}: give --fleet, or set LPAC_FLEET"
-        ) from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: no TOML: {error}") from None
+            f"{path}: cannot be read: there is no such file: give --fleet, or set LPAC_FLEET"
+        )
+    return read_toml_text(path)
 
 
 def parse_fleet(path: Path, text: str) -> FleetConfig:
     """The fleet that a file of this text would describe. Raises ConfigError."""
-    try:
-        mapping = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: no TOML: {error}") from None
+    mapping = parse_toml(text, path)
     slots = mapping.get("slots")
     if isinstance(slots, list) and all(isinstance(slot, dict) for slot in slots):
         mapping["slots"] = [{"height": i} | _without_empty(slot) for i, slot in enumerate(slots)]

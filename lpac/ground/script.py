@@ -6,7 +6,6 @@ sees of the robots what the ground tells. Whoever holds the fleet meanwhile has 
 
 import math
 import re
-import tomllib
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from msgspec import Meta
 from edge.core.file_errors import in_words
 from edge.core.frames import Latitude, Longitude
 from edge.core.schema import Bounded, ConfigError, NonNegative, from_mapping
+from edge.core.toml import read_toml
 from edge.core.world import has_importance, parse_world
 from edge.messages.codes import texts
 from edge.messages.mission import FlightState, GroundState, Heading, Origin, RobotStatus
@@ -219,13 +219,7 @@ def load_script(path: Path, sites: Sites) -> Script:
 
     Looks into the worlds and sites that the script will need, too.
     """
-    try:
-        mapping = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
-    except ValueError as error:
-        raise ConfigError(f"{path}: no TOML: {error}") from None
-    table = from_mapping(ScriptTable, mapping, str(path))
+    table = from_mapping(ScriptTable, read_toml(path), str(path))
     before = _steps(table.before, STEPS_BEFORE, f"{path}: before")
     for step in before:
         if isinstance(step, WorldStep):

@@ -7,7 +7,6 @@ from what robots say of themselves, averaged over their statuses.
 import itertools
 import math
 import os
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +15,8 @@ from typing import NamedTuple
 from geographiclib.geodesic import Geodesic
 
 from edge.core.fence import Fence
-from edge.core.file_errors import in_words
 from edge.core.schema import Bounded, ConfigError, PointXY, from_mapping, require
+from edge.core.toml import read_toml
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.messages.mission import GroundState, Origin, Place, RobotStatus, SlotNumber
 from edge.robot.config import PlainName
@@ -431,16 +430,10 @@ class Sites:
     def load(self, name: str) -> SavedSite:
         """A site that was saved."""
         path = self.path(name)
-        try:
-            mapping = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-        except FileNotFoundError:
+        if not path.exists():
             known = ", ".join(self.names()) or "none"
-            raise ConfigError(f"{path}: there is no such site; known are {known}") from None
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
-        except ValueError as error:
-            raise ConfigError(f"{path}: no TOML: {error}") from None
-        return from_mapping(SavedSite, mapping, str(path))
+            raise ConfigError(f"{path}: there is no such site; known are {known}")
+        return from_mapping(SavedSite, read_toml(path), str(path))
 
     def require_new(self, name: str) -> None:
         """Raises ConfigError if there is a site of that name."""

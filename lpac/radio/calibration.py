@@ -20,7 +20,6 @@ that other networks keep busy looks slow.
 """
 
 import math
-import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -33,6 +32,7 @@ from typing import Any, NamedTuple
 import scipy  # its parts are loaded on first use
 
 from edge.core.schema import ConfigError, from_mapping
+from edge.core.toml import read_toml
 from lpac.radio.airtime import Traffic, Transport, Wifi, airtime, link_quality
 from lpac.radio.records import RadioRecord, read_records
 
@@ -91,10 +91,7 @@ def read_wifi(path: Path | None) -> Calibration:
         raise ConfigError(
             f"{path}: must be a .toml file of the model's values, or a .jsonl file of records"
         )
-    try:
-        mapping = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not TOML: {error}") from None
+    mapping = read_toml(path)
     wifi = from_mapping(Wifi, mapping, str(path))
     return _calibration(wifi, dict.fromkeys(mapping, Source(SourceKind.FILE)))
 

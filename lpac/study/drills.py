@@ -13,6 +13,7 @@ from msgspec import Meta
 
 from edge.core.logger import show
 from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, from_mapping
+from edge.core.toml import read_toml
 from edge.drivers.registry import open_sensor
 from edge.policy.bundle import load_bundle
 from lpac.analysis.flight import FlightRecord
@@ -24,7 +25,6 @@ from lpac.sim.drill.outcome import FlightOutcome, outcome_of
 from lpac.sim.engines import flies
 from lpac.sim.scenario import WORLD_SENSOR
 from lpac.sim.sitl.build import require_build
-from lpac.study.file import read_toml
 from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight, require_planned
 
 DrillEngine = Literal["simulated", "mavlink", "px4"]

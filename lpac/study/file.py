@@ -1,7 +1,6 @@
 """Studies as TOML files; see `Study` for what the keys mean."""
 
 import itertools
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type
 from msgspec import Meta
 
 from edge.core.schema import AtLeastOne, Bounded, ConfigError, NonNegative, from_mapping
+from edge.core.toml import read_toml
 from edge.core.world import parse_world
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.baselines import BaselineName
@@ -86,14 +86,6 @@ class ConditionKeys:
 
 # Keys of a scenario that the study says.
 DRAWN = ("controller", "seed", "features", "scale")
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """What a file holds. Raises ConfigError that names it."""
-    try:
-        return tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: {error}") from None
 
 
 def read_study(

@@ -22,6 +22,7 @@ from edge.core.schema import (
     from_mapping,
     require,
 )
+from edge.core.toml import parse_toml, read_toml_text
 from edge.core.world import MOST_FEATURES
 from edge.policy.bundle import Training
 from export.parameters import PolicyParameters
@@ -241,28 +242,14 @@ class ReadConfig:
         return config_digest(self.text)
 
 
-def read_toml(path: Path) -> str:
-    """The text of a file that is TOML. Raises ConfigError that names the file, and the line."""
-    try:
-        text = path.read_text("utf-8-sig")
-        tomllib.loads(text)
-    except OSError as error:
-        raise ConfigError(f"{path}: {in_words(error)}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text, expected TOML") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: is not TOML: {error}") from None
-    return text
-
-
 def read_config(path: Path) -> ReadConfig:
     """Raises ConfigError that names the file, the line or key, the value and what is allowed."""
-    return config_of(read_toml(path), str(path), path.parent)
+    return config_of(read_toml_text(path), str(path), path.parent)
 
 
 def config_of(text: str, where: str, folder: Path) -> ReadConfig:
     """Of TOML, whose paths are from that folder. Raises ConfigError that begins with `where`."""
-    config = from_mapping(TrainingConfig, tomllib.loads(text), where)
+    config = from_mapping(TrainingConfig, parse_toml(text, where), where)
     network = learnable(config.network, f"{where}: network")
     return ReadConfig(config, network, text, _initial(config, network, where, folder))
 

@@ -130,6 +130,7 @@ PURE = (
 )  # fmt: skip
 BUT = {
     "edge/core/mailbox.py": {"threading"},
+    "edge/core/toml.py": {"pathlib"},
     "edge/robot/inbox.py": {"threading"},
     "edge/identity/guard.py": {"threading"},
     "edge/robot/node.py": {"pathlib"},

@@ -437,7 +437,7 @@ def test_site_is_saved_and_used_again(field: Commanded) -> None:
     (field.folder / "sites" / "torn.toml").write_text("[origin")
     done = field.do("site", "list")
     assert re.search(r"torn +unreadable *\n", done.stdout)
-    assert "torn.toml: no TOML" in done.stderr
+    assert "torn.toml: is not TOML" in done.stderr
     assert re.search(r"park .* used last *\n", done.stdout)
     assert re.search(r"yard .* 3 +\n", done.stdout)
     assert "pads of site park" in field.do("mission", "assign", "--seconds", "0.5").stderr

@@ -79,7 +79,7 @@ def test_whatever_a_configuration_says_is_what_the_training_is_told(tmp_path: Pa
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ('"small.toml"', '"none.toml"', r"none\.toml: there is no such file"),
+        ('"small.toml"', '"none.toml"', r"none\.toml: cannot be read: there is no such"),
         ("seeds = [0, 4]", "seed = 0", r"parts\.toml: unknown key 'seed'; known are base, "),
         ("[0, 4]", "[]", r"seeds = \[\]: must be one or more, at least 0, each once"),
         ("[0, 4]", "[1, 1]", r"seeds = \[1, 1\]: must be one or more, at least 0, each once"),

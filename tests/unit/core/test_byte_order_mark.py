@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge.core.toml import read_toml
 from edge.robot.config import load_config
 from export.parameters import read_parameters
 from lpac.analysis.field_truth import TRUTH_TABLE, read_places
@@ -13,7 +14,7 @@ from lpac.fleet.settings import load_fleet
 from lpac.ground.script import load_script
 from lpac.ground.site import Sites
 from lpac.radio.calibration import read_wifi
-from lpac.train.config import read_toml
+from lpac.study.file import read_study
 from tests.conftest import ROOT
 
 READERS: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -25,6 +26,7 @@ READERS: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "training.toml": (read_toml, (ROOT / "examples" / "quick.toml").read_text()),
     "policy.toml": (read_parameters, (ROOT / "policies" / "lpac_l2_k3_n10_512.toml").read_text()),
+    "study.toml": (read_study, "worlds = 2"),
     "wifi.toml": (read_wifi, "frame_loss = 0.1"),
 }
 

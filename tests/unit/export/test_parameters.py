@@ -174,9 +174,9 @@ def test_mistakes_in_our_file(old: str, new: str, line: str, tmp_path: Path) -> 
 
 def test_files_that_are_no_text(tmp_path: Path) -> None:
     (tmp_path / "model.pt").write_bytes(b"PK\x03\x04\xff\xfe")
-    with pytest.raises(ConfigError, match=r"model\.pt: is not UTF-8 text, expected TOML$"):
+    with pytest.raises(ConfigError, match=r"model\.pt: is not TOML: "):
         read_parameters(tmp_path / "model.pt")
-    with pytest.raises(ConfigError, match=r"absent\.toml: there is no such file or folder$"):
+    with pytest.raises(ConfigError, match=r"absent\.toml: cannot be read: there is no such file"):
         read_parameters(tmp_path / "absent.toml")
     with pytest.raises(ConfigError, match=r": is a folder; a file is needed$"):
         read_parameters(tmp_path)

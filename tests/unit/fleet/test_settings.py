@@ -514,7 +514,7 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ),
         ("buffer_m = 1.5", "buffer_m = 1.0", ["robots.r1, in slots[0]: buffer_m = 1: must be 1.3"]),
         ("[robot]\n#", "[[robot]]\n#", ["robot = [{", "expected a table"]),
-        ("[[slots]]\nrobot = \"r1\"", "[slots]", ["no TOML"]),
+        ("[[slots]]\nrobot = \"r1\"", "[slots]", ["is not TOML"]),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_line_that_names_it(
@@ -553,7 +553,7 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         assert refusal(path).startswith("cannot be read: ")
     path = tmp_path / "fleet.toml"
     path.write_bytes(b'fleet = "\xff"')
-    assert refusal(path).startswith("no TOML")
+    assert refusal(path).startswith("is not TOML")
 
 
 VALUES: st.SearchStrategy[Any] = st.recursive(

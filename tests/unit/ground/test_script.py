@@ -100,7 +100,7 @@ def test_examples_comments_show_the_defaults(script: Path) -> None:
         ("heading_deg = 30.0", "", r"before\[0\] \(origin\): latitude_deg, longitude_deg and"),
         ("# from_robot", "from_robot", r"before\[0\] \(origin\): from_robot: measures the origin"),
         ('file = "world.env"', 'file = "w.env"', r"w.env: cannot be read: there is no such file"),
-        ('[[steps]]\ndo = "takeoff"', "[steps]", "no TOML"),
+        ('[[steps]]\ndo = "takeoff"', "[steps]", "is not TOML"),
         ('at_s = 40.0\nrobot = "r2"', 'at_s = 90.0\nrobot = "r2"',
          r"perturb: at_s = 80.0: r2 has no pilot: must be given"),
         ('do = "rejoin"', 'do = "pilot"', r"perturb: at_s = 80.0: r2 has a pilot already"),

@@ -304,7 +304,7 @@ def test_site_is_read_as_it_was_saved(tmp_path: Path) -> None:
         ("pad_m = [2.0, 2.0]", "pad_m = [2.0, 200.0]", "height 0: pad_m = .*inside the fence"),
         ("[4.0, 4.0]", "[-1.0, 4.0]", r"height 0: landing_point_m = .*at least buffer_m = 1.5"),
         ("buffer_m = 1.5", "bufer_m = 1.5", "fence: unknown key 'bufer_m'"),
-        ("[origin]", "[origin", "no TOML"),
+        ("[origin]", "[origin", "is not TOML"),
     ],
 )  # fmt: skip
 def test_mistake_in_a_site_is_one_line(

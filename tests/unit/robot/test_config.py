@@ -157,7 +157,7 @@ def test_relative_paths_are_meant_from_the_files_folder(
         ("# max_message_age_s = 0.8", "max_message_age_s = -1.0", ["max_message_age_s = -1.0"]),
         ("# max_input_age_s = 1.0", "max_input_age_s = 0.0", ["max_input_age_s = 0.0"]),
         ("[policy]", "policy = 3\n[other]", ["unknown key 'other'"]),
-        ("[policy]", "[policy", ["no TOML", "line 8"]),
+        ("[policy]", "[policy", ["is not TOML", "line 8"]),
     ],
 )
 def test_a_mistake_is_one_line_that_names_it(
@@ -214,7 +214,7 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=f"^{re.escape(str(path))}: cannot be read: "):
             load_config(path)
     (tmp_path / "robot.toml").write_bytes(b'fleet = "\xff"')
-    with pytest.raises(ConfigError, match="no TOML"):
+    with pytest.raises(ConfigError, match="is not TOML"):
         load_config(tmp_path / "robot.toml")
 
 
