@@ -1,102 +1,59 @@
-"""A moment of a simulated flight: the input of all measurements of one robot's tick."""
+"""A moment of a flight: the input of all measurements of one robot's tick."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from edge.core import F32, F64
-from edge.core.aggregation import AggregatedMessage
 from edge.core.memory import RobotMap, RobotMemory
-from edge.core.perception import neighbours_in_range, window_corner
+from edge.core.perception import PerceptionParameters, window_corner
 from edge.core.world import random_features, rasterize
 from edge.drivers.world_sensor import WorldSensor
-from edge.policy.bundle import Manifest
-from edge.policy.family import Policy
-from edge.robot.pac import PacParameters
-from lpac.sim.description import FIELD_SCALE
-from lpac.sim.medium import Medium
-from lpac.sim.swarm import pac_swarm
-from lpac.sim.ticks import Clocks
+from edge.policy.family import Observation, Policy
 
 NEIGHBOURS = 10
-# So many that robots in the middle have ten neighbours.
-_ROBOTS = 16
-_EARLIEST_S, _LATEST_S, _SAMPLE_S = 10.0, 60.0, 0.2
+# Robots see the world on straight paths of so many views, and end within range of each other.
+_VIEWS = 100
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Moment:
-    """One robot in flight with ten neighbours, and everything that its tick takes.
+class Moment(NamedTuple):
+    """Inputs of the tick of one robot with ten neighbours, all in range.
 
     Positions are in model units. `memory` is of what the robot has seen; `robot_map`
-    (world_size, world_size) is the same as one array. `messages` are the neighbours' newest.
+    (world_size, world_size) is the same as one array. `payloads` are the neighbours' newest.
     """
 
     position: F64
     neighbours: F64
-    messages: tuple[AggregatedMessage, ...]
+    payloads: list[F32]
     memory: RobotMemory
     robot_map: F32
 
-    @property
-    def payloads(self) -> list[F32]:
-        """The neighbours' (message_size,) payloads, as the wire gives them."""
-        return [message.payload for message in self.messages]
-
 
 def moment_in_flight(policy: Policy) -> Moment:
-    """The first moment after the start at which a robot has exactly ten neighbours."""
-    manifest = policy.manifest
-    perception = manifest.perception
+    """One robot and what its neighbours say: all have seen parts of a world."""
+    perception = policy.manifest.perception
     assert perception
     rng = np.random.default_rng(1)
-    importance = rasterize(random_features(rng, 10, perception.world_size), perception.world_size)
-    swarm = pac_swarm(
-        policy=policy,
-        importance=importance,
-        positions_m=FIELD_SCALE.position_to_mission_m(
-            rng.uniform(0.0, perception.world_size, (_ROBOTS, 2))
-        ),
-        parameters=PacParameters(
-            scale=FIELD_SCALE,
-            max_speed_m_s=manifest.training.max_speed * FIELD_SCALE.velocity_scale,
-        ),
-        medium=Medium(
-            range_m=perception.communication_range / FIELD_SCALE.env_scale,
-            loss=0.0,
-            delay_s=0.0,
-            rng=rng,
-        ),
-        rng=rng,
-        clocks=Clocks(),
-    )
-    paths: list[F64] = []
-    times_s = np.arange(0.0, _LATEST_S, _SAMPLE_S).tolist()
-    for now_s, positions_m in zip(times_s, swarm.run(times_s), strict=True):
-        positions = FIELD_SCALE.position_to_model(positions_m)
-        paths.append(positions)
-        for robot, position, path in zip(
-            swarm.robots, positions, np.stack(paths, axis=1), strict=True
-        ):
-            messages = robot.mailbox.swap(now_s)
-            neighbours = _positions(messages)
-            near = neighbours_in_range(position, neighbours, perception.communication_range)
-            if now_s >= _EARLIEST_S and len(messages) == near.sum() == NEIGHBOURS:
-                memory, robot_map = _seen_on(path, importance, manifest)
-                return Moment(position, neighbours, messages, memory, robot_map)
-    raise AssertionError(f"no robot had {NEIGHBOURS} neighbours")
+    size = perception.world_size
+    importance = rasterize(random_features(rng, 10, size), size)
+    starts = rng.uniform(0.0, size, (NEIGHBOURS + 1, 2))
+    ends = size / 2.0 + rng.uniform(-0.3, 0.3, starts.shape) * perception.communication_range
+    paths = np.linspace(starts, ends, _VIEWS, axis=1)
+    memory, robot_map = _seen_on(paths[0], importance, perception)
+    payloads = []
+    for number, path in enumerate(paths[1:], 1):
+        agent, theirs = policy.agent(), _seen_on(path, importance, perception)[0]
+        others = np.delete(ends, number, axis=0)
+        seen = agent.observe(Observation(path[-1], theirs.local_map(path[-1]), others, np.zeros(2)))
+        payloads.append(agent.step(seen.features, [], NEIGHBOURS).payload.copy())
+    return Moment(ends[0], ends[1:], payloads, memory, robot_map)
 
 
-def _positions(messages: Sequence[AggregatedMessage]) -> F64:
-    positions_m = np.array([message.position_m[:2] for message in messages]).reshape(-1, 2)
-    return FIELD_SCALE.position_to_model(positions_m)
-
-
-def _seen_on(path: F64, importance: F32, manifest: Manifest) -> tuple[RobotMemory, F32]:
+def _seen_on(
+    path: F64, importance: F32, parameters: PerceptionParameters
+) -> tuple[RobotMemory, F32]:
     """Memory and map of a robot that flew along `path` (T, 2)."""
-    parameters = manifest.perception
-    assert parameters
     memory = RobotMemory(parameters)
     robot_map = RobotMap(parameters.world_size, parameters.unknown_importance)
     sensor = WorldSensor(importance, parameters.sensor_size)

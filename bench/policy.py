@@ -35,7 +35,6 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
 
     Raises RuntimeError if the variants' outputs differ by more than TOLERANCE.
     """
-    progress("policy: a flight for the inputs")
     bundle = load_bundle(BUNDLE)
     policy = LpacPolicy(bundle)
     moment = moment_in_flight(policy)
