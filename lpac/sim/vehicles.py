@@ -36,21 +36,11 @@ class PointVehicles:
 
     def positions_m(self) -> F64:
         """Positions (N, 2) now."""
-        elapsed_s = self.now_s - self._since_s
-        moved_m = self._start_m + self._velocity_m_s * elapsed_s
-        if self._lag_s:
-            moved_m += self._excess_m_s * (-self._lag_s * np.expm1(-elapsed_s / self._lag_s))
-        return self._held_inside(moved_m, self._start_m).T
+        return self._now_m(slice(None)).T
 
     def position_m(self, robot: int) -> F64:
         """Position (2,) of one vehicle now."""
-        start_m = self._start_m[:, robot]
-        elapsed_s = self.now_s - self._since_s[robot]
-        moved_m = start_m + self._velocity_m_s[:, robot] * elapsed_s
-        if self._lag_s:
-            faded_s = -self._lag_s * np.expm1(-elapsed_s / self._lag_s)
-            moved_m += self._excess_m_s[:, robot] * faded_s
-        return self._held_inside(moved_m, start_m)
+        return self._now_m(robot)
 
     def velocities_m_s(self) -> F64:
         """The velocities (N, 2) that the vehicles were told."""
@@ -75,7 +65,12 @@ class PointVehicles:
         self.fly(robot, np.zeros(2))
         self._excess_m_s[:, robot] = 0.0
 
-    def _held_inside(self, moved_m: F64, start_m: F64) -> F64:
+    def _now_m(self, which: int | slice) -> F64:
+        start_m, elapsed_s = self._start_m[:, which], self.now_s - self._since_s[which]
+        moved_m = start_m + self._velocity_m_s[:, which] * elapsed_s
+        if self._lag_s:
+            faded_s = -self._lag_s * np.expm1(-elapsed_s / self._lag_s)
+            moved_m += self._excess_m_s[:, which] * faded_s
         lowest_m = np.minimum(start_m, 0.0)
         highest_m = np.maximum(start_m, self._world_size_m)
         return np.minimum(np.maximum(moved_m, lowest_m), highest_m)
