@@ -14,14 +14,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.robot.config import Rates, load_config
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.truth import TrueTrack
-from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
+from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until, carry_out
 from lpac.ground.station.client import GroundError
 from lpac.ground.station.protocol import CommandReport, Request
 from lpac.sim.drill.faults import Fault
@@ -147,14 +147,7 @@ class ProcessField(FaultyFleet):
 
         Raises what kept a fault from happening, and OverloadError or VehicleError.
         """
-        answer: Any = None
-        while True:
-            try:
-                wanted = procedure.send(answer)
-            except StopIteration as done:
-                result: T = done.value
-                return result
-            answer = self._wait(wanted) if isinstance(wanted, Until) else self._command(wanted)
+        return carry_out(procedure, self._command, self._wait)
 
     # What all kinds of vehicles have in common
 

@@ -3,6 +3,7 @@
 import math
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from edge.core import F64
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.truth import TrueTrack
-from lpac.ground.procedure import NothingComesError, Procedure
+from lpac.ground.procedure import NothingComesError, Procedure, Until, carry_out
 from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
 from lpac.sim.air import GROUND
 from lpac.sim.drill.faults import FAULTS, Fault
@@ -107,17 +108,12 @@ class SimulatedField(FaultyFleet):
 
     def carry_out(self, procedure: Procedure[T]) -> T:
         """Let time pass until it is through; a command that does not end is answered by None."""
-        answer: Any = None
-        while True:
-            try:
-                wanted = procedure.send(answer)
-            except StopIteration as done:
-                result: T = done.value
-                return result
-            try:
-                answer = self.ground.carry_out(_one(wanted))
-            except NothingComesError:
-                answer = None
+
+        def answer(wanted: Request | Until) -> Any:
+            with suppress(NothingComesError):
+                return self.ground.carry_out(_one(wanted))
+
+        return carry_out(procedure, answer, answer)
 
     # What a kind of vehicles has of its own
 
