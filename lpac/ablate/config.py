@@ -5,13 +5,13 @@ base. What goes without DAgger has them too: with `dagger.expert_flights` of 1 t
 the rounds instead of the policy.
 """
 
-import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
+
+import tomlkit
 
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.toml import read_toml
@@ -27,7 +27,6 @@ _EQUAL = (
     "select.duration_s", "select.every_epochs", "perception.sensor_size",
     "training.max_speed", "training.idf_truncation", "training.idf_norm",
 )  # fmt: skip
-_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,7 +171,7 @@ def _trainings(
     for seed in seeds:
         name = f"{variant}-{seed}"
         own = merged(document, {"seed": seed, "export": {"name": name}})
-        trainings.append(PlannedTraining(name, seed, config_of(_as_toml(own), where, folder)))
+        trainings.append(PlannedTraining(name, seed, config_of(tomlkit.dumps(own), where, folder)))
     return tuple(trainings)
 
 
@@ -191,29 +190,3 @@ def _require_equal_compute(config: TrainingConfig, base: TrainingConfig, where: 
                 f"{where}: train.{key} = {value}: must be the base's, {allowed}, or what is "
                 f"compared would not be as much work{hint}"
             )
-
-
-def _as_toml(document: Mapping[str, Any]) -> str:
-    """The text of a document: each of its tables has its heading, and a line for each key."""
-    tables = {key: value for key, value in document.items() if isinstance(value, Mapping)}
-    lines = [_line(key, value) for key, value in document.items() if key not in tables]
-    for name, table in tables.items():
-        lines += ["", f"[{_key(name)}]", *(_line(key, value) for key, value in table.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _line(key: str, value: object) -> str:
-    return f"{_key(key)} = {_value(value)}"
-
-
-def _key(key: str) -> str:
-    return key if _BARE_KEY.fullmatch(key) else _value(key)
-
-
-def _value(value: object) -> str:
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(_line(key, each) for key, each in value.items())}}}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"
-    # Of text and bool JSON is TOML; of numbers and dates Python is.
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)

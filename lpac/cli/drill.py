@@ -6,9 +6,8 @@ import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from msgspec import Meta
@@ -40,24 +39,16 @@ app = new_app()
 _OUT = Path("out/drill")
 
 
-class DrillVehicle(StrEnum):
-    """What the robots of a drill fly."""
-
-    SIMULATED = "simulated"
-    MAVLINK = "mavlink"
-    PX4 = "px4"
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrillOptions:
     """What is flown, how, and where it goes."""
 
     vehicle: Annotated[
-        DrillVehicle,
+        Literal["simulated", "mavlink", "px4"],
         "simulated: on one simulated clock, over all cores; mavlink: one process per robot in real "
         "time, a few flights at once; px4: with real PX4s, one after another. The last two fly "
         "only the faults that `--list` marks.",
-    ] = DrillVehicle.SIMULATED
+    ] = "simulated"
     px4: Px4 = None
     faults: Annotated[
         list[str] | None,
@@ -103,11 +94,11 @@ def drill(options: DrillOptions) -> None:
         return
     if options.seeds is not None and options.seed is not None:
         raise ValueError("--seeds and --seed: give one of them")
-    check_px4(VehicleKind(vehicle.value), options.px4)
-    faults_of(names, vehicle.value, "--fault")
+    check_px4(VehicleKind(vehicle), options.px4)
+    faults_of(names, vehicle, "--fault")
     flown = Drill(
         faults=names, seeds=options.seeds or 1, first_seed=options.seed or 0, robots=options.robots,
-        engine=vehicle.value, bundle=str(options.bundle), sensor=options.sensor,
+        engine=vehicle, bundle=str(options.bundle), sensor=options.sensor,
     )  # fmt: skip
     again = options.seed is not None and len(names) == 1
     fly_faults(flown, options.out, options.px4, options.ray, as_json=options.as_json, again=again)

@@ -27,7 +27,7 @@ from lpac.cli.options import (
 )
 from lpac.cli.printing import lines_of, progress_of
 from lpac.cli.programs import as_many_as_carried, say_if_carried, serve
-from lpac.cli.transport import WifiFile, calibration, link_line, wifi_lines
+from lpac.cli.transport import WifiFile, calibration, wifi_lines
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -419,7 +419,7 @@ def _show_points(
     typer.echo(f"{flier}, {counted(scenario.robots, 'robot')}, seed {scenario.seed}: {result}")
     if scenario.radio is not None:
         found = calibration(drawn.wifi, transport=True)
-        typer.echo(f"{scenario.radio.transport}: {link_line(*scenario.link)}; it assumes")
+        typer.echo(f"{scenario.radio.transport}: {scenario.link.in_words}; it assumes")
         typer.echo("\n".join(wifi_lines(found)))
 
 

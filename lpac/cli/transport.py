@@ -40,14 +40,6 @@ def calibration(wifi: Path | None, *, transport: bool) -> "Calibration":
     return read_wifi(wifi)
 
 
-def link_line(loss: float, delay_s: float) -> str:
-    """Describe loss and delay of messages."""
-    return (
-        f"by the model {100.0 * loss:.3g} % of messages are lost, and the others travel for "
-        f"{1e3 * delay_s:.3g} ms on average"
-    )
-
-
 def wifi_lines(found: "Calibration") -> list[str]:
     """Each value of the channel, as TOML, with what it comes from."""
     return [

@@ -4,15 +4,14 @@ import itertools
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from edge.policy.bundle import Bundle
 from lpac.analysis.template import render
-from lpac.paper.claims import Claim, Effort, Experiments, Sizes, claims_of
+from lpac.paper.claims import Effort, Sizes, claims_of
 from lpac.study.hearing_robot import HearingRobot, message_bytes
 
 # Of which the median is how long one takes.
@@ -83,17 +82,9 @@ def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, 
         for chapter in CHAPTERS
         if chapter.name in made_by
     }
-    claims = claims_of(
-        Experiments(
-            e1=documents.get("e1"), e2=documents.get("e2"), e3=documents.get("e3"),
-            asynchrony=documents.get("async"), transfer=documents.get("transfer"),
-            network=documents.get("network"),
-        ),
-        sizes_of(bundle),
-        effort_of(bundle),
-    )  # fmt: skip
+    claims = claims_of(documents, sizes_of(bundle), effort_of(bundle))
     told = {
-        "claims": [_claim_json(claim) for claim in claims],
+        "claims": [asdict(claim) for claim in claims],
         "made_by": {name: dict(its) for name, its in made_by.items()},
     }
     (folder / "claims.json").write_text(json.dumps(told, indent=2) + "\n")
@@ -125,13 +116,6 @@ def effort_of(bundle: Bundle) -> Effort:
         robots[number].step()
         took_s[step, number] = time.perf_counter() - began_s
     return Effort(*np.median(took_s, axis=0).tolist())
-
-
-def _claim_json(claim: Claim) -> dict[str, Any]:
-    return {
-        "name": claim.name, "paper": claim.paper, "rule": claim.rule, "ours": claim.ours,
-        "verdict": claim.verdict.value,
-    }  # fmt: skip
 
 
 def _pictures(folder: Path, chapter: Chapter) -> dict[str, bytes]:

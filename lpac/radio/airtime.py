@@ -156,6 +156,14 @@ class LinkQuality(NamedTuple):
     loss: float
     delay_s: float
 
+    @property
+    def in_words(self) -> str:
+        """A line of a report."""
+        return (
+            f"by the model {100.0 * self.loss:.3g} % of messages are lost, and the others travel "
+            f"for {1e3 * self.delay_s:.3g} ms on average"
+        )
+
 
 def airtime(transport: Transport, wifi: Wifi, traffic: Traffic) -> Airtime:
     """Airtime of the fleet's traffic.

@@ -20,7 +20,7 @@ from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.baselines import BaselineName
 from lpac.sim.description import FIELD_SCALE
 from lpac.sim.engines import Engine, EngineName, engine_of, loaded_bundle
-from lpac.sim.failure import NONE_LOST, Failure, LostRobots
+from lpac.sim.failure import NONE_LOST, LostRobots
 from lpac.sim.fleet.layout import Layout, pads_for_all
 from lpac.sim.scenario import Scenario
 from lpac.study.flights import CLAIRVOYANT, PlannedFlight, sizes_of, task_of
@@ -343,12 +343,9 @@ class Study(Bounded):
         if bias_m is not None:
             scenario = replace(scenario, position_bias=_pairs(bias_m * FIELD_SCALE.env_scale))
         if method.trained:
-            return replace(scenario, failures=self._failures(condition))
+            lost = condition.lost.failures(scenario.robots)
+            return replace(scenario, failures=(*scenario.failures, *lost))
         return _of_baseline(scenario, method.name, condition.lost.robots)
-
-    def _failures(self, condition: Condition) -> tuple[Failure, ...]:
-        scenario = condition.scenario
-        return (*scenario.failures, *condition.lost.failures(scenario.robots))
 
 
 _USUAL = Scenario()

@@ -10,6 +10,7 @@ from lpac.analysis import style
 from lpac.analysis.figures import snapshots_and_costs
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.statistics import VERDICT_RULE, Interval95, what_would_tell
+from lpac.radio.airtime import LinkQuality
 from lpac.sim.cores import Pool
 from lpac.sim.engines import EngineName
 from lpac.study import figures, rates
@@ -78,7 +79,14 @@ def _tables(told: Mapping[str, Any], condition: Mapping[str, Any]) -> Iterator[T
         over = "all missions of such a team"
     elif told["trials_per_world"] > 1:
         over = f"{over}, {told['trials_per_world']} trials in each"
-    note = [*_link(condition), *(_failures(told, each) for each in policies)]
+    note = []
+    if condition["scenario"]["radio"] is not None:
+        note.append(LinkQuality(**condition["scenario"]["link"]).in_words)
+    note += [
+        f"{each['name']}: {_share(each['fails'])} of the worlds end above "
+        f"{told['fails_above']:g} x clairvoyant; in {_share(each['rises_again'])} costs rise again"
+        for each in policies
+    ]
     if condition["compared"] is not None:
         [a, b, *_] = results
         note += _verdict(condition["compared"], a["name"], b["name"], told["worlds"])
@@ -98,15 +106,6 @@ def _tables(told: Mapping[str, Any], condition: Mapping[str, Any]) -> Iterator[T
         yield Table(headings, rows)
 
 
-def _link(condition: Mapping[str, Any]) -> Iterator[str]:
-    if condition["scenario"]["radio"] is not None:
-        link = condition["scenario"]["link"]
-        yield (
-            f"by the model {100.0 * link['loss']:.1f} % of messages are lost, and they are "
-            f"{1e3 * link['delay_s']:.0f} ms late"
-        )
-
-
 def _row(result: Mapping[str, Any]) -> list[str]:
     final, over = result["final"], result["over_clairvoyant"]
     mean, low, high = final["mean"]
@@ -121,14 +120,6 @@ def _row(result: Mapping[str, Any]) -> list[str]:
         f"{over['quantiles']['0.9']:.2f}",
         f"{result['over_best_of_ten']['ratio_of_means'][0]:.3f}",
     ]
-
-
-def _failures(told: Mapping[str, Any], result: Mapping[str, Any]) -> str:
-    return (
-        f"{result['name']}: {_share(result['fails'])} of the worlds end above "
-        f"{told['fails_above']:g} x clairvoyant; in "
-        f"{_share(result['rises_again'])} costs rise again"
-    )
 
 
 def _share(told: Mapping[str, Any]) -> str:

@@ -116,7 +116,7 @@ ONLY_IN = {
     "textual": {"lpac/ground/terminal/"},
     "aiohttp": {"lpac/ground/map/"},
     "foxglove": {"lpac/ground/foxglove/"},
-    "tomlkit": {"lpac/fleet/writer.py"},
+    "tomlkit": {"lpac/fleet/writer.py", "lpac/ablate/config.py"},
     "nacl": {"edge/identity/signature.py", "edge/identity/group.py"},
     "cryptography": {"lpac/fleet/authority.py", "lpac/fleet/web_certificate.py"},
     # What makes the documentation's site reads all parts; none of them knows of it.
