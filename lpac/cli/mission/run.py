@@ -12,7 +12,7 @@ import typer
 
 from lpac.cli.ground_requests import address, looking
 from lpac.cli.options import DEFAULT_FLEET, Fleet
-from lpac.cli.printing import BAD, FAINT, NOTABLE, LiveView, styled
+from lpac.cli.printing import LiveView
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -146,24 +146,15 @@ class _View:
 
     def _render(self) -> "Group":
         from rich.console import Group
-        from rich.table import Table
         from rich.text import Text
 
-        from edge.messages.mission import FlightState
+        from lpac.cli.live import fleet_table
 
-        rows = Table.grid(padding=(0, 2, 0, 0))
-        for robot in self.subscriber.snapshot.robots:
-            if robot.name not in self.robots:
-                continue
-            status = robot.status
-            if status is None or not robot.fresh:
-                rows.add_row(styled(robot.name, ""), styled("not heard", BAD))
-                continue
-            style = "" if status.state is FlightState.MISSION else NOTABLE
-            rows.add_row(
-                styled(robot.name, ""),
-                styled(status.state.value, style),
-                styled("" if status.battery is None else f"{status.battery:.0%}", FAINT),
-                styled(status.reason.text, FAINT),
-            )
-        return Group(Text(self._title(), "bold"), Text("Ctrl-C holds the fleet", "bold red"), rows)
+        table = fleet_table(
+            {
+                robot.name: robot.status if robot.fresh else None
+                for robot in self.subscriber.snapshot.robots
+                if robot.name in self.robots
+            }
+        )
+        return Group(Text(self._title(), "bold"), Text("Ctrl-C holds the fleet", "bold red"), table)
