@@ -42,6 +42,9 @@ _FALLS_M = 0.5
 # PX4 comes down at 1.5 m/s, and slower near what it takes to be the ground.
 _TOUCHDOWN_M_S = 2.0
 
+# A vehicle that is lower stands on the ground.
+ON_GROUND_BELOW_M = 0.1
+
 LANDING = (Px4Mode.LAND, Px4Mode.DESCEND)
 
 
@@ -123,7 +126,7 @@ class InsideFence:
     def figure(self, flight: FlightRecord) -> Figure:
         edges, margins_m = _fence(flight).edges(), [math.inf]
         for vehicle in _of(flight, self.whose):
-            flown_m = vehicle.position_m[vehicle.airborne & vehicle.armed & ~_piloted(vehicle)]
+            flown_m = vehicle.position_m[_above(vehicle) & vehicle.armed & ~_piloted(vehicle)]
             margins_m += [float(edges.distances_m(place_m).min()) for place_m in flown_m[:, :2]]
         of = " of who is carried" if self.beyond_m != POSITION_ERROR_M else ""
         return Figure(f"true fence margin{of}", min(margins_m), -self.beyond_m, "m", at_least=True)
@@ -180,7 +183,7 @@ class ComesDownGently:
     def figure(self, flight: FlightRecord) -> Figure:
         fastest_m_s = 0.0
         for vehicle in _unkilled(flight):
-            touches = np.flatnonzero(vehicle.airborne[:-1] & ~vehicle.airborne[1:])
+            touches = np.flatnonzero(_above(vehicle)[:-1] & ~_above(vehicle)[1:])
             fastest_m_s = max(
                 fastest_m_s, float(-vehicle.velocity_m_s[touches, 2].min(initial=0.0))
             )
@@ -211,7 +214,7 @@ class AllDown:
     """In the end all stand on the ground, with their motors off."""
 
     def figure(self, flight: FlightRecord) -> Figure:
-        up = sum(bool(v.armed[-1] or v.airborne[-1]) for v in flight.vehicles)
+        up = sum(bool(v.armed[-1] or _above(v)[-1]) for v in flight.vehicles)
         return Figure("not down in the end", up, 0, "")
 
 
@@ -292,7 +295,7 @@ class Down:
     def figure(self, flight: FlightRecord) -> Figure:
         latest_s = 0.0
         for later in _parts(flight, self.whose):
-            up = np.flatnonzero(later.armed | later.airborne)
+            up = np.flatnonzero(later.armed | _above(later))
             down = not len(up) or up[-1] + 1 < len(later.time_s)
             at_s = float(later.time_s[up[-1]]) if len(up) else flight.fault.begin_s
             latest_s = max(latest_s, at_s - flight.fault.begin_s if down else math.inf)
@@ -318,7 +321,7 @@ class Stands:
         since_s, fastest_m_s = _since_s(flight, self.after), 0.0
         for vehicle in _of(flight, self.whose):
             part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
-            moving = part.airborne & part.armed & ~part.is_in(*LANDING)
+            moving = _above(part) & part.armed & ~part.is_in(*LANDING)
             if self.may_part:
                 moving &= _alone_m(flight, vehicle, part.time_s) > _NEAR_M
             speeds_m_s = np.hypot(*part.velocity_m_s[moving, :2].T)
@@ -427,7 +430,7 @@ class FliesOn:
         since_s, shares = _since_s(flight, self.after), [1.0]
         for vehicle in _of(flight, self.whose):
             part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
-            flown = part.is_in(Px4Mode.OFFBOARD) & part.is_velocity & part.airborne
+            flown = part.is_in(Px4Mode.OFFBOARD) & part.is_velocity & _above(part)
             shares.append(float(flown.mean()) if len(flown) else -math.inf)
         least = min(shares)
         return Figure("share of the mission", least, self.share, "", at_least=True)
@@ -446,7 +449,7 @@ class ComesBack:
     def figure(self, flight: FlightRecord) -> Figure:
         edges, latest_s = _fence(flight).edges(), 0.0
         for part in _parts(flight, self.whose):
-            flown = part.airborne & part.armed & ~part.is_in(Px4Mode.HOLD, *LANDING)
+            flown = _above(part) & part.armed & ~part.is_in(Px4Mode.HOLD, *LANDING)
             for at_s, place_m in zip(part.time_s[flown], part.position_m[flown, :2], strict=True):
                 if edges.distances_m(place_m).min() < -POSITION_ERROR_M:
                     latest_s = max(latest_s, float(at_s) - flight.fault.begin_s)
@@ -591,7 +594,7 @@ class TakesOff:
 
     def figure(self, flight: FlightRecord) -> Figure:
         flew = min(
-            bool((v.armed & v.airborne)[v.time_s > flight.fault.begin_s].any())
+            bool((v.armed & _above(v))[v.time_s > flight.fault.begin_s].any())
             for v in _of(flight, self.whose)
         )
         return Figure("took off", flew, 1, "", at_least=True)
@@ -658,7 +661,7 @@ class NotFaster:
     def figure(self, flight: FlightRecord) -> Figure:
         fastest_m_s = 0.0
         for part in _parts(flight, self.whose, until_s=self.until_s):
-            flown = part.velocity_m_s[part.is_in(Px4Mode.OFFBOARD) & part.airborne, :2]
+            flown = part.velocity_m_s[part.is_in(Px4Mode.OFFBOARD) & _above(part), :2]
             fastest_m_s = max(fastest_m_s, float(np.hypot(*flown.T).max(initial=0.0)))
         return Figure("greatest speed", fastest_m_s, self.speed_m_s, "m/s")
 
@@ -688,6 +691,12 @@ def _parts(flight: FlightRecord, whose: Whose, *, until_s: float = math.inf) -> 
     """Of each of them what it did from the fault on, and until then."""
     begin_s = flight.fault.begin_s
     return (vehicle.between(begin_s, begin_s + until_s) for vehicle in _of(flight, whose))
+
+
+def _above(vehicle: TrueTrack) -> Bools:
+    """(T,): whether it is off the ground, by its place alone."""
+    above: Bools = vehicle.position_m[:, 2] > ON_GROUND_BELOW_M
+    return above
 
 
 def _piloted(vehicle: TrueTrack) -> Bools:
@@ -746,7 +755,7 @@ def _distances_m(one: TrueTrack, other: TrueTrack) -> F64:
     """3-D, at all times when at least one of the two is in the air."""
     times_s = one.time_s
     if len(times_s) == len(other.time_s) and np.abs(times_s - other.time_s).max(initial=0) < 1e-6:
-        first_m, second_m, second_up = one.position_m, other.position_m, other.airborne
+        first_m, second_m, second_up = one.position_m, other.position_m, _above(other)
     else:
         first_s, last_s = max(times_s[0], other.time_s[0]), min(times_s[-1], other.time_s[-1])
         times_s = times_s[(times_s >= first_s) & (times_s <= last_s)]
@@ -755,7 +764,7 @@ def _distances_m(one: TrueTrack, other: TrueTrack) -> F64:
         second_m = np.stack(
             [np.interp(times_s, other.time_s, other.position_m[:, a]) for a in range(3)], axis=1
         )
-        second_up = other.airborne[np.searchsorted(other.time_s, times_s)]
+        second_up = _above(other)[np.searchsorted(other.time_s, times_s)]
         one = one.between(times_s[0], times_s[-1] + _STEP_S / 2.0)
     distances_m: F64 = np.linalg.norm(first_m - second_m, axis=1)
-    return distances_m[(one.airborne[: len(distances_m)]) | second_up]
+    return distances_m[(_above(one)[: len(distances_m)]) | second_up]

@@ -4,10 +4,9 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from edge.core import F64
 from edge.core.fence import Fence
@@ -29,7 +28,6 @@ from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.flight import Timeline
 from lpac.sim.drill.injections import Do, FenceWithout, Injection, OperatorOrders, OrderedKind
 from lpac.sim.fleet.layout import Layout
-from lpac.sim.px4.vehicle import Truth
 from lpac.sim.scenario import WORLD_SENSOR, Scenario
 
 # Receivers with corrections, whose estimates still wander by 0.15 m along each axis, and heights
@@ -37,8 +35,6 @@ from lpac.sim.scenario import WORLD_SENSOR, Scenario
 EXACT = ErrorBudget(
     gps_m=0.6, height_apart_m=0.2, height_common_m=0.0, takeoffs_height_m=0.0, pads_height_m=0.2
 )
-# A vehicle that stands on the ground, for whoever judges by its place alone.
-ON_GROUND_BELOW_M = 0.1
 # How long an order that nobody waits for is valid.
 _ORDER_S = 10.0
 
@@ -97,7 +93,7 @@ class FaultyFleet(ABC):
 
     @abstractmethod
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """What the vehicles did, as `track_of` has it."""
+        """What the vehicles did, in the world's frame."""
 
     def highest_m(self) -> float:
         """The height of the robot that flies highest."""
@@ -145,7 +141,8 @@ class FaultyFleet(ABC):
 
     def record(self, timeline: Timeline) -> FlightRecord:
         """The whole flight, on the vehicles' clock."""
-        layout, tracks = self.layout, self.tracks()
+        layout = self.layout
+        tracks = [layout.mission_track(track) for track in self.tracks()]
         perception = layout.bundle.manifest.perception
         assert perception is not None
         return FlightRecord(
@@ -169,31 +166,6 @@ class FaultyFleet(ABC):
                 drone_m=layout.scenario.budget.drone_m,
                 late_s=self.late_s(),
             ),
-        )
-
-    def track_of(self, entries: Sequence[Truth]) -> TrueTrack:
-        """What a vehicle noted in the world's frame: north, east, down."""
-
-        def of(value: Callable[[Truth], object], kind: type[Any]) -> npt.NDArray[Any]:
-            return np.array([value(entry) for entry in entries], kind)
-
-        to_mission = self.layout.to_mission
-        north_east_down_m = of(lambda entry: entry.position_m, np.float64).reshape(-1, 3)
-        velocity_m_s = of(lambda entry: entry.velocity_m_s, np.float64).reshape(-1, 3)
-        position_m = north_east_down_m @ to_mission.rotation.T + to_mission.local_origin_m
-        # The world's ground is at down = 0, whatever height the mission frame's origin has.
-        position_m[:, 2] = -north_east_down_m[:, 2]
-        return TrueTrack(
-            time_s=of(lambda entry: entry.time_s, np.float64),
-            position_m=position_m,
-            airborne=position_m[:, 2] > ON_GROUND_BELOW_M,
-            velocity_m_s=velocity_m_s @ to_mission.rotation.T,
-            mode=of(lambda entry: entry.mode, np.int64),
-            armed=of(lambda entry: entry.armed, np.bool_),
-            setpoint_at_s=of(lambda entry: entry.setpoint_at_s, np.float64),
-            is_velocity=of(lambda entry: entry.follows == "velocity", np.bool_),
-            velocity_error_m_s=of(lambda entry: entry.velocity_error_m_s, np.float64),
-            commands=of(lambda entry: entry.commands, np.int64),
         )
 
     # Where vehicles are

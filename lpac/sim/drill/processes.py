@@ -53,7 +53,7 @@ from lpac.sim.drill.injections import (
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.processes import Fleet
-from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError
+from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError, track_of
 from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.scenario import Scenario
@@ -353,7 +353,7 @@ class MavlinkField(ProcessField):
         """What they noted."""
         with self.stepped:
             truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
-        return tuple(map(self.track_of, truths))
+        return tuple(map(track_of, truths))
 
 
 class Px4Field(ProcessField):
@@ -419,17 +419,15 @@ class Px4Field(ProcessField):
 
         Raises VehicleError without one, or if a PX4 has not taken what a fault is done by.
         """
-        px4s, tracks = self.fleet.vehicles, []
-        assert isinstance(px4s, Px4Build)
-        for robot, vehicle in enumerate(self.vehicles):
+        tracks = self.fleet.vehicles.tracks()
+        for robot, track in enumerate(tracks):
+            vehicle = self.vehicles[robot]
             if vehicle.unconfirmed:
                 names = ", ".join(vehicle.unconfirmed)
                 raise VehicleError(f"could not be flown: the PX4 of r{robot} did not take {names}")
-            logged = px4s.logged_truth(robot)
-            if not logged:
+            if not len(track.mode):
                 raise VehicleError(f"the PX4 of r{robot} has left no log of its flight")
-            tracks.append(self.track_of(logged).shifted(-self._made_s))
-        return tuple(tracks)
+        return tuple(track.shifted(-self._made_s) for track in tracks)
 
 
 def fly_fault(fleet: Fleet, fault: Fault) -> FlightRecord:

@@ -47,6 +47,7 @@ from lpac.sim.drill.injections import (
 )
 from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
+from lpac.sim.fleet.vehicles import track_of
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.scenario import WORLD_SENSOR, Scenario
@@ -140,7 +141,7 @@ class SimulatedField(FaultyFleet):
 
     def tracks(self) -> tuple[TrueTrack, ...]:
         """What they noted."""
-        return tuple(self.track_of(vehicle.truth) for vehicle in self.vehicles)
+        return tuple(track_of(vehicle.truth) for vehicle in self.vehicles)
 
     def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
         """Now."""

@@ -4,14 +4,11 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from edge.core.logger import errors_only
 from edge.messages.mission import RobotStatus
 from edge.policy.bundle import load_bundle
 from lpac.analysis.flight import FlightRecord, ScriptRecord
 from lpac.analysis.logs import logs_of
-from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.air import Air
@@ -21,6 +18,7 @@ from lpac.sim.fleet.listener import Say
 from lpac.sim.fleet.pilot import LOOKS_S, Pilot, perturbations
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
+from lpac.sim.fleet.vehicles import track_of
 from lpac.sim.points import SAMPLE_S
 from lpac.sim.scenario import Scenario
 
@@ -147,7 +145,7 @@ class _Notes:
         return flight_of(
             fleet.layout,
             logs_of(self._said.values()),
-            self._tracks(),
+            [track_of(each.vehicle.truth) for each in fleet.vehicles],
             fleet.schedule.unix_s() - fleet.schedule.monotonic_s(),
             0.0,
             [
@@ -168,14 +166,3 @@ class _Notes:
                 commands=flown.told_commands(),
             ),
         )
-
-    def _tracks(self) -> list[TrueTrack]:
-        truths = [each.vehicle.truth for each in self._fleet.vehicles]
-        return [
-            TrueTrack(
-                time_s=np.array([entry.time_s for entry in truth]),
-                position_m=np.array([entry.position_m for entry in truth]).reshape(-1, 3),
-                airborne=np.array([not entry.landed for entry in truth], np.bool_),
-            )
-            for truth in truths
-        ]

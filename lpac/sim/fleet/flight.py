@@ -227,7 +227,7 @@ def flight_of(
     """
     manifest = layout.bundle.manifest
     assert manifest.perception is not None and layout.features is not None
-    truth = {robot: _in_mission_frame(layout, t, unix_s) for robot, t in enumerate(tracks)}
+    truth = {robot: layout.mission_track(t).shifted(unix_s) for robot, t in enumerate(tracks)}
     logs.truths.append(truth)
     logs.names |= {robot: simulated_name(robot) for robot in truth}
     if truth_in is not None:
@@ -275,10 +275,3 @@ def _program(
 def _share(first: _Moment, last: _Moment, before: Usage, after: Usage) -> float:
     """The share of a core that a process took between two moments."""
     return max(0.0, after.cpu_s - before.cpu_s) / max(last.time_s - first.time_s, 1e-9)
-
-
-def _in_mission_frame(layout: Layout, track: TrueTrack, unix_s: float) -> TrueTrack:
-    rotation, origin_m = layout.to_mission.rotation, layout.to_mission.local_origin_m
-    return TrueTrack(
-        track.time_s + unix_s, track.position_m @ rotation.T + origin_m, track.airborne
-    )

@@ -13,6 +13,7 @@ from edge.core.world import format_world
 from edge.flight.margins import places_apart
 from edge.messages.mission import Origin
 from edge.policy.bundle import load_bundle, make_bundle, write_bundle
+from lpac.analysis.truth import TrueTrack
 from lpac.fleet.settings import Places
 from lpac.fleet.writer import assign, write_fleet, write_robot
 from lpac.sim.description import FIELD_SCALE, fence_around, robot_table
@@ -111,6 +112,15 @@ class Layout:
             self.pads_m = self.landing_points_m = self._draw_pads(exact_m)
         else:
             self.pads_m, self.landing_points_m, self.vehicles = self._draw_vehicles()
+
+    def mission_track(self, track: TrueTrack) -> TrueTrack:
+        """One in the world's frame, as a record has it."""
+        rotation, origin_m = self.to_mission.rotation, self.to_mission.local_origin_m
+        position_m = track.position_m @ rotation.T + origin_m
+        # The world's ground is at down = 0, whatever height the mission frame's origin has.
+        position_m[:, 2] = -track.position_m[:, 2]
+        velocity_m_s = track.velocity_m_s @ rotation.T
+        return replace(track, position_m=position_m, velocity_m_s=velocity_m_s)
 
     def to_world_m(self, place_m: F64) -> tuple[float, float]:
         """North and east, m, of a place (2,) of the mission frame."""

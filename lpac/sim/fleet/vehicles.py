@@ -2,15 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from lpac.analysis.truth import TrueTrack
 from lpac.sim.ports import free_ports
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.server import Instance, Px4Server
-from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.px4.vehicle import Px4Vehicle, Truth
 
 
 class AutopilotAddress(NamedTuple):
@@ -47,6 +48,26 @@ class Vehicles(Protocol):
 
     def lost_s(self) -> float:
         """By how much they fell behind real time, s."""
+
+
+def track_of(entries: Sequence[Truth]) -> TrueTrack:
+    """What a simulated vehicle noted, on its own clock and in the world's frame."""
+
+    def of(name: str, kind: type[Any], *shape: int) -> npt.NDArray[Any]:
+        return np.array([getattr(entry, name) for entry in entries], kind).reshape(-1, *shape)
+
+    return TrueTrack(
+        time_s=of("time_s", np.float64),
+        position_m=of("position_m", np.float64, 3),
+        airborne=~of("landed", np.bool_),
+        velocity_m_s=of("velocity_m_s", np.float64, 3),
+        mode=of("mode", np.int64),
+        armed=of("armed", np.bool_),
+        setpoint_at_s=of("setpoint_at_s", np.float64),
+        is_velocity=np.array([entry.follows == "velocity" for entry in entries], np.bool_),
+        velocity_error_m_s=of("velocity_error_m_s", np.float64),
+        commands=of("commands", np.int64),
+    )
 
 
 class SimulatedVehicles:
@@ -86,14 +107,8 @@ class SimulatedVehicles:
         """All of the same times."""
         with self.stepped:
             truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
-        return tuple(
-            TrueTrack(
-                time_s=self._server.started_s + np.array([entry.time_s for entry in truth]),
-                position_m=np.array([entry.position_m for entry in truth]).reshape(-1, 3),
-                airborne=np.array([not entry.landed for entry in truth], np.bool_),
-            )
-            for truth in truths
-        )
+        started_s = self._server.started_s
+        return tuple(track_of(truth).shifted(started_s) for truth in truths)
 
     def forget(self) -> None:
         """Keep of each only where it is."""

@@ -23,7 +23,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -34,8 +34,6 @@ from edge.core import F64
 from lpac.analysis.field_truth import CLOCK_TABLE
 from lpac.analysis.truth import TrueTrack
 from lpac.sim.fleet.vehicles import AutopilotAddress, VehicleError
-from lpac.sim.px4.modes import Px4Mode
-from lpac.sim.px4.vehicle import Truth
 from lpac.sim.px4.world import WorldOrigin
 from lpac.sim.sitl import ordinary
 from lpac.sim.sitl.log import read_setpoints, read_truth
@@ -241,49 +239,34 @@ class Px4Build:
                 longest_s = max(longest_s, (passed_s[:, 0] - passed_s[:, 1]).max(initial=0.0))
         return longest_s
 
-    def logged_truth(self, number: int) -> list[Truth]:
-        """Read a PX4's own log, which is whole once PX4 has ended; [] if it says nothing.
-
-        Times are `time.monotonic()`.
-        """
-        instance = self._instances[number]
-        truth = read_truth(instance.logs(), self._world) if instance.clock else None
-        if truth is None or not len(truth.status_s):
-            return []
-        setpoints = read_setpoints(instance.logs())
-        setpoints_s = instance.to_monotonic_s(setpoints.time_s).tolist()
-        statuses = np.maximum(np.searchsorted(truth.status_s, truth.time_s, "right") - 1, 0)
-        lasts = np.searchsorted(setpoints.time_s, truth.time_s, "right") - 1
-        entries = []
-        for at_s, place_m, velocity_m_s, error_m_s, status, last in zip(
-            instance.to_monotonic_s(truth.time_s).tolist(), truth.position_m.tolist(),
-            truth.velocity_m_s.tolist(), truth.velocity_error_m_s.tolist(), statuses.tolist(),
-            lasts.tolist(), strict=True,
-        ):  # fmt: skip
-            heard = last >= 0
-            entries.append(
-                Truth(
-                    time_s=at_s, position_m=tuple(place_m), velocity_m_s=tuple(velocity_m_s),
-                    mode=Px4Mode(int(truth.navigation_state[status])),
-                    armed=bool(truth.armed[status]), landed=place_m[2] > -_AIRBORNE_ABOVE_M,
-                    setpoint_at_s=setpoints_s[last] if heard else -math.inf,
-                    follows=("velocity" if setpoints.is_velocity[last] else "position")
-                    if heard else None,
-                    velocity_error_m_s=error_m_s,
-                )
-            )  # fmt: skip
-        return entries
-
     def pids(self) -> list[int]:
         """The processes of the PX4s that run."""
         processes = [instance.process for instance in self._instances]
         return [p.pid for p in processes if p is not None and p.poll() is None]
 
     def _track(self, instance: _Instance) -> TrueTrack:
+        """Without PX4's modes and setpoints where there is no whole log."""
         truth = read_truth(instance.logs(), self._world) if instance.clock else None
         if truth is not None:
             airborne = truth.position_m[:, 2] < -_AIRBORNE_ABOVE_M
-            return TrueTrack(instance.to_monotonic_s(truth.time_s), truth.position_m, airborne)
+            time_s = instance.to_monotonic_s(truth.time_s)
+            track = TrueTrack(time_s, truth.position_m, airborne)
+            if not len(truth.status_s):
+                return track
+            setpoints = read_setpoints(instance.logs())
+            status = np.maximum(np.searchsorted(truth.status_s, truth.time_s, "right") - 1, 0)
+            # The first is before any setpoint.
+            last = np.searchsorted(setpoints.time_s, truth.time_s, "right")
+            return replace(
+                track,
+                velocity_m_s=truth.velocity_m_s,
+                mode=truth.navigation_state[status],
+                armed=truth.armed[status],
+                setpoint_at_s=np.append(-np.inf, instance.to_monotonic_s(setpoints.time_s))[last],
+                is_velocity=np.append(False, setpoints.is_velocity)[last],
+                velocity_error_m_s=truth.velocity_error_m_s,
+                commands=np.zeros(len(time_s), np.int64),
+            )
         with self._heard_lock:
             places = tuple(instance.places)
         position_m = np.array([place.position_m for place in places]).reshape(-1, 3)

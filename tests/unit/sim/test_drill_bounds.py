@@ -49,7 +49,6 @@ from lpac.sim.drill.bounds import (
     always,
 )
 from lpac.sim.drill.faults import FAULTS, Fault
-from lpac.sim.drill.field import ON_GROUND_BELOW_M
 from lpac.sim.px4.modes import Px4Mode
 
 FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 25.0)
@@ -70,7 +69,7 @@ def a_vehicle(pad_m: tuple[float, float], height_m: float) -> TrueTrack:
     return TrueTrack(
         time_s=t,
         position_m=position_m,
-        airborne=z_m > ON_GROUND_BELOW_M,
+        airborne=z_m > 0.0,
         velocity_m_s=np.gradient(position_m, 0.04, axis=0),
         mode=np.where(armed, mode, Px4Mode.HOLD),
         armed=armed,
@@ -93,16 +92,10 @@ def flight_of(*vehicles: TrueTrack, orders: tuple[GivenOrder, ...] = ORDERS) -> 
     )  # fmt: skip
 
 
-def moved(vehicle: TrueTrack, **fields: Any) -> TrueTrack:
-    """The same, but for these fields."""
-    moved = replace(vehicle, **fields)
-    return replace(moved, airborne=moved.position_m[:, 2] > ON_GROUND_BELOW_M)
-
-
 def changed(flight: FlightRecord, **fields: Any) -> FlightRecord:
     """The same, but for what the first vehicle did."""
     first, *others = flight.vehicles
-    return flight_of(moved(first, **fields), *others)
+    return flight_of(replace(first, **fields), *others)
 
 
 def after(begin_s: float, value: Any, otherwise: Any, end_s: float = math.inf) -> Any:
@@ -115,11 +108,11 @@ def after(begin_s: float, value: Any, otherwise: Any, end_s: float = math.inf) -
 FIRST, SECOND = a_vehicle((5.0, 5.0), 5.0), a_vehicle((15.0, 15.0), 9.5)
 WELL = flight_of(FIRST, SECOND)
 FLOWN_M, BESIDE_M = FIRST.position_m, SECOND.position_m
-AT_REST = moved(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
+AT_REST = replace(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
 STANDS = flight_of(AT_REST, SECOND)
-NEAR = flight_of(AT_REST, moved(SECOND, position_m=BESIDE_M - (8.0, 8.0, 0.0)))
+NEAR = flight_of(AT_REST, replace(SECOND, position_m=BESIDE_M - (8.0, 8.0, 0.0)))
 # The second lands 8.5 m from its pad.
-BESIDE = flight_of(FIRST, moved(SECOND, position_m=after(45.0, (15.0, 23.5, 0.0), BESIDE_M)))
+BESIDE = flight_of(FIRST, replace(SECOND, position_m=after(45.0, (15.0, 23.5, 0.0), BESIDE_M)))
 STANDS_STILL = changed(WELL, position_m=after(FAULT_S, (5.0, 5.0, 5.0), FLOWN_M))
 DRIFTS_M_S = after(25.0, (0.9, 0.0, 0.0), FLOWN_M * 0.0, 26.0)
 PILOTED = after(25.0, Px4Mode.POSCTL, FIRST.mode, 30.0)
@@ -139,7 +132,7 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
     (
         InsideFence(whose="others"),
         changed(WELL, position_m=after(30.0, (-20.0, 5.0, 5.0), FLOWN_M, 31.0)),
-        flight_of(FIRST, moved(FIRST, position_m=FLOWN_M - (30.0, 0.0, 0.0))),
+        flight_of(FIRST, replace(FIRST, position_m=FLOWN_M - (30.0, 0.0, 0.0))),
     ),
     (
         InsideFence(25.0, "hit"),
@@ -164,7 +157,7 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
     (
         NobodyFalls(),
         flight_of(
-            moved(FIRST, armed=FIRST.armed & (TIMES_S < 45.0)),
+            replace(FIRST, armed=FIRST.armed & (TIMES_S < 45.0)),
             SECOND,
             orders=(*ORDERS, GivenOrder("kill", (0,), 44.9, 45.0)),
         ),
