@@ -117,8 +117,8 @@ class Layout:
         """One in the world's frame, as a record has it."""
         rotation, origin_m = self.to_mission.rotation, self.to_mission.local_origin_m
         position_m = track.position_m @ rotation.T + origin_m
-        # The world's ground is at down = 0, whatever height the mission frame's origin has.
-        position_m[:, 2] = -track.position_m[:, 2]
+        # The world's ground is at down = 0, whatever height the frame's origin has; no -0.0.
+        position_m[:, 2] = 0.0 - track.position_m[:, 2]
         velocity_m_s = track.velocity_m_s @ rotation.T
         return replace(track, position_m=position_m, velocity_m_s=velocity_m_s)
 
