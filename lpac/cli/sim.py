@@ -377,7 +377,7 @@ def _programs(run: RunOptions) -> Literal["mavlink", "px4"]:
 def _show(
     scenario: "Scenario", record: "FlightRecord", run: RunOptions, drawn: FlightOptions
 ) -> None:
-    from lpac.sim.summary import summary, summary_lines
+    from lpac.sim.flight_summary import summary, summary_lines
 
     if run.out:
         from lpac.sim.flight_files import write_flight

@@ -10,8 +10,8 @@ from edge.core.world import format_world
 from lpac.analysis.figures import overview, snapshots_and_costs
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.style import save
+from lpac.sim.flight_summary import summary
 from lpac.sim.scenario import Scenario
-from lpac.sim.summary import summary
 
 
 def write_flight(scenario: Scenario, record: FlightRecord, folder: Path) -> None:

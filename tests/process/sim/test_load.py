@@ -8,8 +8,8 @@ from lpac.sim.fleet import load
 from lpac.sim.fleet.flight import fly_programs
 from lpac.sim.fleet.load import robots_carried
 from lpac.sim.fleet.processes import OVERLOADED_S, Fleet
+from lpac.sim.flight_summary import summary_lines
 from lpac.sim.scenario import Scenario
-from lpac.sim.summary import summary_lines
 from tests.conftest import SHIPPED
 
 STEPS = (

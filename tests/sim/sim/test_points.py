@@ -14,9 +14,9 @@ from lpac.analysis.flight import FlightRecord
 from lpac.radio.airtime import Wifi
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.failure import Failure
+from lpac.sim.flight_summary import summary
 from lpac.sim.points import FlightMoment, fly_points
 from lpac.sim.scenario import Controller, Scenario
-from lpac.sim.summary import summary
 from lpac.sim.ticks import Clocks
 
 CONTROLLERS: tuple[Controller, ...] = (

@@ -47,12 +47,12 @@ from lpac.sim.fleet.layout import ORIGIN, Settings
 from lpac.sim.fleet.recorded import RecordingError
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
+from lpac.sim.flight_summary import summary
 from lpac.sim.points import SAMPLE_S
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon
 from lpac.sim.scenario import Scenario
-from lpac.sim.summary import summary
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE
 

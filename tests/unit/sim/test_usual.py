@@ -8,8 +8,8 @@ import pytest
 
 from edge.policy.bundle import load_bundle
 from lpac.shipped import SHIPPED_BUNDLE
+from lpac.sim.flight_summary import _fence_line
 from lpac.sim.scenario import Scenario
-from lpac.sim.summary import _fence_line
 from lpac.sim.usual import USUAL_JSON, Usual, judgement, usual_points, usual_whole
 
 BUNDLE_ID = load_bundle(SHIPPED_BUNDLE).id
