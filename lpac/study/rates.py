@@ -7,8 +7,8 @@ next, as they do in the synchronous graph neural network, and what a robot says 
 a period. Results are held against those at the field's rates.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,19 +67,33 @@ FIELD = Timing.of(Scenario())
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimingResult:
-    """What a timing came to over K worlds: `costs` (K, 3) at `times_s`, over those at the start.
+    """What a timing came to over K worlds: `curves` (K, C) at `time_s`, over the cost at the start.
 
-    `worlds` names them, or the missions. `area` (K,) is the mean cost over the flight, `over_field`
-    at each of the times the ratio of the mean cost to that with the field's timing, with its
-    interval: over the same worlds in pairs, and of missions over these and those, which may differ.
+    `worlds` names them, or the missions. `over_field` is, at each of `times_s`, the ratio of the
+    mean cost to that with the field's timing, with its interval: over the same worlds in pairs, and
+    of missions over these and those, which may differ.
     """
 
     timing: Timing
     worlds: tuple[str, ...]
-    times_s: tuple[float, ...]
-    costs: F64
-    area: F64
-    over_field: tuple[Interval95, ...]
+    time_s: F64
+    curves: F64
+    over_field: tuple[Interval95, ...] = ()
+
+    @property
+    def times_s(self) -> tuple[float, ...]:
+        """When costs are told."""
+        return tuple(share * float(self.time_s[-1]) for share in _SHARES)
+
+    @property
+    def costs(self) -> F64:
+        """(K, 3): at `times_s`."""
+        return np.array([np.interp(self.times_s, self.time_s, curve) for curve in self.curves])
+
+    @property
+    def area(self) -> F64:
+        """(K,): the mean cost over the flight."""
+        return mean_over_time(self.time_s, self.curves)
 
     @property
     def means(self) -> tuple[Interval95, ...]:
@@ -94,33 +108,14 @@ def results_of(
 
     Raises ValueError if none is.
     """
-    by_timing = {Timing.of(condition.scenario): its[0] for condition, its in flown.items()}
-    if FIELD not in by_timing:
+    timings = {Timing.of(condition.scenario): its[0] for condition, its in flown.items()}
+    if FIELD not in timings:
         raise ValueError("rates: no condition has the field's, with which others are compared")
-    results = []
-    for timing in dict.fromkeys((FIELD, *by_timing)):
-        own, field = (_costs(by_timing[each]) for each in (timing, FIELD))
-        over_field = tuple(
-            paired_bootstrap(a[None], b[None], ratio_of_means, same_trainings=True)
-            for a, b in zip(own.T, field.T, strict=True)
-        )
-        its = by_timing[timing]
-        times_s = _times_s(float(its.time_s[-1]))
-        results.append(
-            TimingResult(timing, tuple(worlds), times_s, own, its.area.mean(axis=0), over_field)
-        )
-    return results
-
-
-def _times_s(duration_s: float) -> tuple[float, ...]:
-    return tuple(share * duration_s for share in _SHARES)
-
-
-def _costs(result: MethodResult) -> F64:
-    """(K, 3)."""
-    curves = result.curves.mean(axis=0)
-    times_s = _times_s(float(result.time_s[-1]))
-    return np.array([np.interp(times_s, result.time_s, curve) for curve in curves])
+    results = [
+        TimingResult(timing, tuple(worlds), its.time_s, its.curves.mean(axis=0))
+        for timing, its in timings.items()
+    ]
+    return _over_field(results, paired=True)
 
 
 def results_of_logs(records: Mapping[str, FlightRecord]) -> list[TimingResult]:
@@ -129,30 +124,23 @@ def results_of_logs(records: Mapping[str, FlightRecord]) -> list[TimingResult]:
     Those that are not in `is_comparable` are left out. Raises ValueError if none of the others has
     the field's rates.
     """
-    by_timing: dict[Timing, dict[str, FlightRecord]] = {FIELD: {}}
+    time_s = np.linspace(0.0, LOGGED_S, 1 + int(LOGGED_S))
+    timings: dict[Timing, dict[str, F64]] = {}
     for name, record in records.items():
         if record.rates is not None and is_comparable(record):
-            by_timing.setdefault(Timing(*record.rates), {})[name] = record
-    if not by_timing[FIELD]:
+            curve = np.interp(time_s, record.curve_time_s, record.normalized)
+            timings.setdefault(Timing(*record.rates), {})[name] = curve
+    if FIELD not in timings:
         raise ValueError(
             f"no mission of {LOGGED_S:g} s was flown with perception at "
             f"{FIELD.perception_hz:g} Hz and policy at {FIELD.policy_hz:g} Hz, with which the "
             "others are compared"
         )
-    in_field = _costs_of_logs(by_timing[FIELD].values())
-    results = []
-    for timing, its in by_timing.items():
-        costs = _costs_of_logs(its.values())
-        over_field = tuple(
-            # As many trainings of one world: each side's are drawn by themselves.
-            paired_bootstrap(own[:, None], theirs[:, None], ratio_of_means)
-            for own, theirs in zip(costs.T, in_field.T, strict=True)
-        )
-        area = np.array([_area(record) for record in its.values()])
-        results.append(
-            TimingResult(timing, tuple(its), _times_s(LOGGED_S), costs, area, over_field)
-        )
-    return results
+    results = [
+        TimingResult(timing, tuple(its), time_s, np.array(list(its.values())))
+        for timing, its in timings.items()
+    ]
+    return _over_field(results, paired=False)
 
 
 def is_comparable(record: FlightRecord) -> bool:
@@ -160,15 +148,21 @@ def is_comparable(record: FlightRecord) -> bool:
     return record.rates is not None and bool(record.curve_time_s[-1] > LOGGED_S - 1.0)
 
 
-def _costs_of_logs(records: Iterable[FlightRecord]) -> F64:
-    """(K, 3)."""
-    return np.array([np.interp(_times_s(LOGGED_S), r.curve_time_s, r.normalized) for r in records])
+def _over_field(results: Sequence[TimingResult], *, paired: bool) -> list[TimingResult]:
+    """Each held against that with the field's timing, which comes first."""
+    in_order = sorted(results, key=lambda result: result.timing != FIELD)
+    field = in_order[0].costs
 
+    def ratio(own: F64, theirs: F64) -> Interval95:
+        if paired:
+            return paired_bootstrap(own[None], theirs[None], ratio_of_means, same_trainings=True)
+        # As many trainings of one world: each side's are drawn by themselves.
+        return paired_bootstrap(own[:, None], theirs[:, None], ratio_of_means)
 
-def _area(record: FlightRecord) -> float:
-    times_s = np.linspace(0.0, LOGGED_S, 1 + int(LOGGED_S))
-    curve = np.interp(times_s, record.curve_time_s, record.normalized)
-    return float(mean_over_time(times_s, curve))
+    return [
+        replace(result, over_field=tuple(map(ratio, result.costs.T, field.T)))
+        for result in in_order
+    ]
 
 
 def said_kb_s(message_bytes: int, policy_hz: float) -> float:
