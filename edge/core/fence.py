@@ -102,7 +102,8 @@ class Edges(NamedTuple):
 
     def distances_m(self, point_m: F64) -> F64:
         """(n,): how far inside each edge's line a point (2,) is."""
-        return self.inward @ point_m - self.offsets_m
+        along_m: F64 = self.inward.dot(point_m)
+        return along_m - self.offsets_m
 
 
 @functools.lru_cache(maxsize=64)  # asked for many times in each tick of the control loop

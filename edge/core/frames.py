@@ -17,6 +17,7 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, TypeVar
 
 import numpy as np
@@ -29,6 +30,20 @@ from edge.core.schema import Bounded, Positive, require
 Latitude = Annotated[float, Meta(ge=-90.0, le=90.0)]
 Longitude = Annotated[float, Meta(ge=-180.0, le=180.0)]
 _Array = TypeVar("_Array", F32, F64)
+
+
+@lru_cache(maxsize=8)
+def m_per_deg(latitude_deg: float) -> tuple[float, float]:
+    """Lengths of a degree to the north and to the east on the WGS84 ellipsoid, m.
+
+    Up to 45 degrees of latitude, a place 100 m away is off by 1 mm, one 1 km away by 0.1 m.
+    """
+    semi_major_m, eccentricity_2 = 6378137.0, 6.69437999014e-3
+    latitude = math.radians(latitude_deg)
+    w_2 = 1.0 - eccentricity_2 * math.sin(latitude) ** 2
+    meridian_m = semi_major_m * (1.0 - eccentricity_2) / w_2**1.5
+    normal_m = semi_major_m / math.sqrt(w_2) * math.cos(latitude)
+    return math.radians(meridian_m), math.radians(normal_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,19 +128,24 @@ class LocalTransform:
 
     def local_to_mission(self, position_local_m: F64) -> F64:
         """p_M = R (p_L + (d cos alpha, d sin alpha, -altitude)), m."""
-        return self.rotation @ position_local_m + self.local_origin_m
+        return self._turned(position_local_m) + self.local_origin_m
 
     def mission_to_local(self, position_mission_m: F64) -> F64:
         """p_L = R p_M - (d cos alpha, d sin alpha, -altitude), m."""
-        return self.rotation @ (position_mission_m - self.local_origin_m)
+        return self._turned(position_mission_m - self.local_origin_m)
 
     def velocity_to_mission(self, velocity_local_m_s: F64) -> F64:
         """v_M = R v_L, m/s."""
-        return self.rotation @ velocity_local_m_s
+        return self._turned(velocity_local_m_s)
 
     def velocity_to_local(self, velocity_mission_m_s: F64) -> F64:
         """v_L = R v_M, m/s."""
-        return self.rotation @ velocity_mission_m_s
+        return self._turned(velocity_mission_m_s)
+
+    def _turned(self, vector: F64) -> F64:
+        # `@` takes twice as long for so few numbers.
+        turned: F64 = self.rotation.dot(vector)
+        return turned
 
 
 @dataclass(frozen=True, slots=True)

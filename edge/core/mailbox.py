@@ -124,18 +124,19 @@ class Mailbox:
             newest = self._handed_out | self._received if self._handed_out else self._received
             received = sorted(newest.items())
         kept_s = self._kept_s
-        return tuple(
+        neighbours = [
             Neighbour(
                 robot_id,
                 message.position_m,
                 message.velocity_m_s,
-                max(now_s - born_s, 0.0),
+                age_s if age_s > 0.0 else 0.0,
                 message.trial,
                 message.shared,
             )
             for robot_id, (message, born_s) in received
-            if now_s - born_s < kept_s
-        )
+            if (age_s := now_s - born_s) < kept_s
+        ]
+        return tuple(neighbours)
 
     def reject(self, reason: Rejection) -> None:
         """Count a message that did not come this far."""

@@ -48,13 +48,11 @@ class RobotMap:
     def window(self, corner: tuple[int, int], out: F32) -> F32:
         """Fill the square `out` from `corner` on and return it; the outside of the world is 0."""
         size = out.shape[0]
-        out[:] = 0.0
+        if min(corner) < 0 or max(corner) + size > self._world_size:
+            out[:] = 0.0
         for key, tile_part, out_part in self._overlaps(corner, size):
             tile = self._tiles.get(key)
-            if tile is not None:
-                out[out_part] = tile[tile_part]
-            elif self._unseen:
-                out[out_part] = self._unseen
+            out[out_part] = self._unseen if tile is None else tile[tile_part]
         return out
 
     def _overlaps(

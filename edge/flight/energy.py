@@ -5,6 +5,7 @@ consumption of this flight is measured, so that a weak pack shows after a minute
 """
 
 import math
+from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -81,7 +82,7 @@ class Consumption:
     def __init__(self, parameters: EnergyParameters) -> None:
         self._parameters = parameters
         self._armed_at_s: float | None = None
-        self._recent: deque[tuple[float, float | None, float | None]] = deque()
+        self._share, self._voltage_v = _Recent(), _Recent()
         self._samples: deque[tuple[float, float]] = deque(maxlen=_SAMPLES)
         self._endurance_s = parameters.endurance_s
 
@@ -94,9 +95,9 @@ class Consumption:
         self, now_s: float, armed: bool | None, share: float | None, voltage_v: float | None
     ) -> None:
         """Take the autopilot's reading of the battery: its remaining share, and its voltage."""
-        self._recent.append((now_s, share, voltage_v))
-        while now_s - self._recent[0][0] > _MEDIAN_S:
-            self._recent.popleft()
+        self._share.hear(now_s, share)
+        if self._parameters.cells:
+            self._voltage_v.hear(now_s, voltage_v)
         if not armed:
             self._armed_at_s = None
             self._samples.clear()
@@ -105,7 +106,7 @@ class Consumption:
         due_s = self._samples[-1][0] + _SAMPLE_S if self._samples else -math.inf
         if now_s - self._armed_at_s < _SETTLED_S or now_s < due_s:
             return
-        smooth = self._median(1)
+        smooth = self._share.median()
         if smooth is None:
             return
         self._samples.append((now_s, smooth))
@@ -115,25 +116,38 @@ class Consumption:
 
     def energy(self, until_share: float, home_s: float | None) -> Energy | None:
         """The estimate: `until_share` is when the battery is critical. None if nothing is heard."""
-        share, cells = self._median(1), self._parameters.cells
+        share, voltage_v = self._share.median(), self._voltage_v.median()
         if share is None:
             return None
-        voltage_v = self._median(2) if cells else None
         return Energy(
             lasts_s=max(share - until_share, 0.0) * self._endurance_s,
             home_s=home_s,
-            cell_v=None if voltage_v is None else voltage_v / cells,
+            cell_v=None if voltage_v is None else voltage_v / self._parameters.cells,
             low_cell_v=self._parameters.low_cell_v,
         )
 
-    def _median(self, field: int) -> float | None:
+
+class _Recent:
+    """Readings of one value in the last few seconds, and their median."""
+
+    def __init__(self) -> None:
+        self._heard: deque[tuple[float, float | None]] = deque()
+        # The finite ones, in ascending order.
+        self._ordered: list[float] = []
+
+    def hear(self, now_s: float, value: float | None) -> None:
+        if value is not None and math.isfinite(value):
+            insort(self._ordered, value)
+        self._heard.append((now_s, value))
+        while now_s - self._heard[0][0] > _MEDIAN_S:
+            _, old = self._heard.popleft()
+            if old is not None and math.isfinite(old):
+                del self._ordered[bisect_left(self._ordered, old)]
+
+    def median(self) -> float | None:
+        ordered = self._ordered
         # A battery that is silent now is not known, whatever it said before.
-        if not self._recent or self._recent[-1][field] is None:
-            return None
-        values = [value for entry in self._recent if (value := entry[field]) is not None]
-        # numpy's takes twenty times as long for so few.
-        ordered = sorted(filter(math.isfinite, values))
-        if not ordered:
+        if not ordered or self._heard[-1][1] is None:
             return None
         middle, is_odd = divmod(len(ordered), 2)
         return ordered[middle] if is_odd else (ordered[middle - 1] + ordered[middle]) / 2.0

@@ -77,7 +77,7 @@ def in_the_way(
     """Robots that stand at that landing point, which is not their own; and how far from it, m."""
     apart = places_apart(errors.position_m, errors.position_m)
     away = [(each, each.away_m(landing_point_m)) for each in standing]
-    return [(each, m) for each, m in away if not each.is_on_its_own and not apart.holds(m)]
+    return [(each, m) for each, m in away if not apart.holds(m) and not each.is_on_its_own]
 
 
 def place_to_land(

@@ -14,6 +14,7 @@ where one comes in, a velocity goes out as 0, and a point as None.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -84,11 +85,11 @@ def nearest(position_m: Sequence[float], neighbours: Iterable[Neighbour]) -> Clo
     Neighbours of which something is not known are left out.
     """
     distances = [
-        Closest(neighbour.robot_id, math.dist(_extrapolated(neighbour), position_m))
+        (neighbour.robot_id, math.dist(_extrapolated(neighbour), position_m))
         for neighbour in neighbours
         if _is_known(neighbour)
     ]
-    return min(distances, key=lambda closest: closest.distance_m, default=None)
+    return Closest(*min(distances, key=itemgetter(1))) if distances else None
 
 
 def clear_height_m(
@@ -399,7 +400,7 @@ def _extrapolated(neighbour: Neighbour) -> Vector:
 
 
 def _is_known(neighbour: Neighbour) -> bool:
-    return _plausible(neighbour.position_m, neighbour.velocity_m_s, (neighbour.age_s,))
+    return _plausible((*neighbour.position_m, *neighbour.velocity_m_s, neighbour.age_s))
 
 
 def _caps_at_edges(

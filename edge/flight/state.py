@@ -9,6 +9,7 @@ estimator's zero is not the pad.
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Annotated, Literal, NamedTuple
 
 from msgspec import Meta
@@ -193,7 +194,7 @@ class FlightInputs:
     px4_change: Px4Change | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Robot:
     """The robot that flies: what does not change during a flight.
 
@@ -238,12 +239,12 @@ class Robot:
         if not buffer.holds(fence.buffer_m):
             raise ValueError(f"buffer_m = {fence.buffer_m:g}: {buffer}")
 
-    @property
+    @cached_property
     def place(self) -> Place:
         """Its place in the flight."""
         return Place(self.parameters.slot, self.parameters.landing_point_m)
 
-    @property
+    @cached_property
     def separation(self) -> SeparationLimits:
         """How far it stays from the others, who err as it does and fly by the same parameters."""
         p, errors = self.parameters, self.errors
@@ -261,7 +262,7 @@ class Robot:
             silence=self.silence,
         )
 
-    @property
+    @cached_property
     def silence(self) -> SilenceLimits:
         """Limits of another robot that fell silent."""
         p, limits = self.parameters, self.limits

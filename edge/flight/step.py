@@ -92,11 +92,13 @@ def _look(t: Tick) -> FlightMemory:
         flight = _with(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
     if not is_silent(flight, now_s) and (flight.reached or flight.state not in STEERED):
         flight = _with(flight, silent_until_s=-math.inf)
+    disarmed = vehicle.connected and vehicle.armed is False
     flight = _with(
         flight,
         lift=_lift(t),
         ground_at_s=now_s if t.ground_heard else flight.ground_at_s,
         remote_control_at_s=now_s if vehicle.remote_control else flight.remote_control_at_s,
+        disarmed_at_s=now_s if disarmed else flight.disarmed_at_s,
     )
     landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
     down = flight.state is _S.LAND and in_air(flight, vehicle, now_s) is False
@@ -106,12 +108,10 @@ def _look(t: Tick) -> FlightMemory:
         if flight.state is _S.LAND and flight.reached and vehicle.mode is not Mode.LAND:
             # PX4 goes on landing by itself; if it does not, it is asked again.
             flight = replace(flight, reached=False, asked_at_s=now_s)
-    if vehicle.connected and vehicle.armed is False:
-        flight = replace(flight, disarmed_at_s=now_s)
-        # What was on its way when arming was called off has arrived by then.
-        looked = vehicle.heartbeat_at_s > flight.since_s + STALE_TELEMETRY_S
-        if flight.state in ON_GROUND and looked:
-            flight = _with(flight, armed_by="")
+    # What was on its way when arming was called off has arrived by then.
+    looked = vehicle.heartbeat_at_s > flight.since_s + STALE_TELEMETRY_S
+    if disarmed and flight.state in ON_GROUND and looked:
+        flight = _with(flight, armed_by="")
     flight = _with(flight, alone_since_s=_alone_since_s(t))
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))

@@ -190,8 +190,11 @@ class Unguarded:
         return {}
 
 
+_SOME_ROBOT, _SOME_OPERATOR = Speaker(Role.ROBOT, ""), Speaker(Role.OPERATOR, "")
+
+
 def _hear_by_key(hear: Hear, key: str, data: bytes) -> None:
-    hear(key, data, Speaker(Role.ROBOT if key.startswith("robot/") else Role.OPERATOR, ""))
+    hear(key, data, _SOME_ROBOT if key.startswith("robot/") else _SOME_OPERATOR)
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,8 +112,8 @@ class FlightControl:
         self.fell_silent: tuple[Neighbour, ...] = ()
         # By robot id: the last that was heard of it in this frame, and when that was so.
         self._last_places: dict[int, tuple[Neighbour, float]] = {}
-        # The same of beacons that tell a place, and of who flies.
-        self._last_words: dict[int, tuple[Neighbour, float]] = {}
+        # The last beacon of who flies that tells a place, in this frame.
+        self._last_words: dict[int, HeardBeacon] = {}
         # The last beacon of each, in this frame: who stands somewhere may have been switched off.
         self._last_beacons: dict[int, Beacon] = {}
         self._lands_beside_m: Point | None = None
@@ -381,9 +381,11 @@ class FlightControl:
             if beacon.state is FlightState.PILOT or _is_off_height(beacon)
         }
         return tuple(
+            each
+            if each.shared is None and each.robot_id not in piloted
             # Flight has no use for their maps, and the log would hold each of them at each tick.
-            Neighbour(robot_id, position_m, velocity_m_s, age_s, trial, None, robot_id in piloted)
-            for robot_id, position_m, velocity_m_s, age_s, trial, _, _ in (*heard, *told)
+            else each._replace(shared=None, is_piloted=each.robot_id in piloted)
+            for each in (*heard, *told)
         )
 
     def _revoked_places(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
@@ -409,17 +411,22 @@ class FlightControl:
 
         Who is not listened to any more is none of these: its last word may have been a lie.
         """
-        for beacon, heard_at_s in peers:
-            told = last_word(beacon, silence)
+        for heard_beacon in peers:
+            beacon = heard_beacon.beacon
             if beacon.armed is False:
                 self._last_words.pop(beacon.robot_id, None)
-            elif told is not None and beacon.frame_id == self._pac.frame_id:
-                self._last_words[beacon.robot_id] = told, heard_at_s
+            elif (
+                beacon.armed
+                and beacon.position_m is not None
+                and beacon.velocity_m_s is not None
+                and beacon.frame_id == self._pac.frame_id
+            ):
+                self._last_words[beacon.robot_id] = heard_beacon
         others = {self.assignment.robot.robot_id, *(n.robot_id for n in heard), *self.revoked}
         return tuple(
             told._replace(age_s=now_s - at_s)
-            for robot_id, (told, at_s) in sorted(self._last_words.items())
-            if robot_id not in others
+            for robot_id, (beacon, at_s) in sorted(self._last_words.items())
+            if robot_id not in others and (told := last_word(beacon, silence)) is not None
         )
 
     def _look_where_to_land(

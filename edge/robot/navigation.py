@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.core import F64
-from edge.core.frames import LocalTransform, MissionFrame
+from edge.core.frames import LocalTransform, MissionFrame, m_per_deg
 from edge.core.ports import Odometry, Vehicle
 from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
 from edge.core.vehicle import (
@@ -103,10 +103,10 @@ class Navigation:
         origin, position_m = vehicle.origin, vehicle.position_local_m
         if origin is None or position_m is None or not self._is_known(vehicle):
             return None
-        north_m, east_m, _ = position_m
-        # A mission that points north has x to the east.
-        pointing_north = MissionFrame(origin.latitude_deg, origin.longitude_deg, heading_rad=0.0)
-        return pointing_north.to_global_deg(east_m, north_m)
+        # For people: the geodesic would take fifty times as long.
+        north_m, east_m = m_per_deg(origin.latitude_deg)
+        longitude_deg = (origin.longitude_deg + position_m[1] / east_m + 180.0) % 360.0 - 180.0
+        return origin.latitude_deg + position_m[0] / north_m, longitude_deg
 
     def to_local(self, setpoint: MissionSetpoint, vehicle: VehicleState) -> Setpoint | None:
         """The setpoint in the vehicle's local frame; None when there is no telling.

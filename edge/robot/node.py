@@ -8,6 +8,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
+from operator import attrgetter
 
 from edge.core.logger import log
 from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
@@ -64,6 +65,7 @@ _FIELDS: dict[type, tuple[str, ...]] = {
     kind: tuple(field.name for field in dataclasses.fields(kind))
     for kind in (RobotStatus, VehicleState, PolicyTick)
 }
+_VALUES = {kind: attrgetter(*names) for kind, names in _FIELDS.items()}
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
 
 
@@ -199,7 +201,7 @@ class RobotNode:
             self._inbox.put_beacon(beacon, now_s)
         rejection = None
         if len(data) > BEACON_BYTES:
-            rejection = self._pac.receive(data[BEACON_BYTES:], now_s, sender=sender)
+            rejection = self._pac.receive(data, now_s, sender=sender, start=BEACON_BYTES)
         self._ports.recorder.record(
             "received",
             unix_now_s,
@@ -248,8 +250,7 @@ class RobotNode:
         if tick is None:
             return
         self._publish_message(tick.message)
-        record = {name: getattr(tick, name) for name in _FIELDS[PolicyTick]}
-        self._ports.recorder.record("policy", self._ports.clock.unix_s(), record)
+        self._ports.recorder.record("policy", self._ports.clock.unix_s(), _fields(tick))
 
     def _tell_once(self, problem: str) -> None:
         if problem and problem not in self._told_problems:
@@ -379,13 +380,8 @@ class RobotNode:
             # The policy is silent, or hangs: neighbours must not lose this robot's place.
             self._publish_message()
         vehicle = self._ports.vehicle.state()
-        logged: tuple[tuple[str, type, object], ...] = (
-            ("status", RobotStatus, status),
-            ("vehicle", VehicleState, vehicle),
-        )
-        for topic, kind, value in logged:
-            fields = {name: getattr(value, name) for name in _FIELDS[kind]}
-            self._ports.recorder.record(topic, unix_now_s, fields)
+        self._ports.recorder.record("status", unix_now_s, _fields(status))
+        self._ports.recorder.record("vehicle", unix_now_s, _fields(vehicle))
         if status.position_m is not None:
             yaw_rad = status.heading_rad
             if yaw_rad is not None and status.origin is not None:
@@ -525,6 +521,11 @@ class RobotNode:
         robot_id = self._config.robot_id
         is_claimed = self._link is not None and self._link.is_claimed(robot_id)
         return is_claimed or robot_id in self._guard.robots_said_twice()
+
+
+def _fields(value: RobotStatus | VehicleState | PolicyTick) -> dict[str, object]:
+    kind = type(value)
+    return dict(zip(_FIELDS[kind], _VALUES[kind](value), strict=True))
 
 
 def _news(status: RobotStatus) -> tuple[object, ...]:

@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,7 @@ from edge.policy.family import (
     step_problem,
 )
 
+_Array = TypeVar("_Array", F32, F64)
 Position = tuple[float, float, float]  # in the mission frame, m
 
 
@@ -79,14 +80,15 @@ def message_bytes(policy: Policy, payload: PayloadType) -> tuple[int, int]:
 
 
 # The robots of one process, as in a simulator, hear the same bytes within a moment.
-_decode = functools.lru_cache(maxsize=8)(decode)
+@functools.lru_cache(maxsize=8)
+def _decode(data: bytes, start: int, **own: Any) -> AggregatedMessage | Rejection:
+    return decode(memoryview(data)[start:], **own)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Timed:
-    """A value that one thread replaces whole and another reads."""
+class _Timed(NamedTuple, Generic[_Array]):
+    """An array that one thread replaces whole and another reads."""
 
-    value: F32
+    value: _Array
     time_s: float
 
 
@@ -153,8 +155,9 @@ class Pac:
         # Replaced as a whole, before the features, so that no message is sent without a map.
         self._told = _Told(0, None)
         self._sequence = 0
-        self._features: _Timed | None = None
-        self._action: _Timed | None = None
+        self._features: _Timed[F32] | None = None
+        # The velocity (2,) that `control` gives.
+        self._action: _Timed[F64] | None = None
         self.clock = FleetClock()
         self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
         self._sensor_problem = self._observe_problem = self._step_problem = ""
@@ -174,13 +177,17 @@ class Pac:
         self._features = None
         self.mailbox.clear()
 
-    def receive(self, data: bytes, now_s: float, *, sender: int | None = None) -> Rejection | None:
+    def receive(
+        self, data: bytes, now_s: float, *, sender: int | None = None, start: int = 0
+    ) -> Rejection | None:
         """Put a neighbour's message into the mailbox; returns, and counts, why it was not.
 
-        `sender` is the robot that it came from, for whoever knows: no other's is taken then.
+        It is what is in `data` from `start` on. `sender` is the robot that it came from, for
+        whoever knows: no other's is taken then.
         """
         message = _decode(
             data,
+            start,
             bundle_id=self._policy.bundle_id,
             frame_id=self.frame_id,
             message_size=self._policy.message_size,
@@ -254,15 +261,17 @@ class Pac:
         # Before the swap, which may clear the mailbox: the neighbours are more than the messages.
         heard = [n.position_m for n in self.mailbox.neighbours(now_s)]
         messages = self.mailbox.swap(now_s)
-        near = self._in_range(own, [message.position_m for message in messages])
-        degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
+        near = self._in_range(own, [*(message.position_m for message in messages), *heard])
+        near, heard_near = near[: len(messages)], near[len(messages) :]
+        degree = max(int(heard_near.sum()), int(near.sum()))
         heeded = [message for message, is_near in zip(messages, near, strict=True) if is_near]
         payloads = tuple(message.payload for message in heeded)
         step = self._step(features.value, payloads, degree)
         if step is None:
             return None
         velocity, payload = step
-        self._action = _Timed(velocity, now_s)
+        velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(velocity.astype(np.float64))
+        self._action = _Timed(limit_speed(velocity_m_s, self._parameters.max_speed_m_s), now_s)
         self._sequence += 1
         told = self._told
         message = AggregatedMessage(
@@ -294,12 +303,7 @@ class Pac:
         None when there is no fresh action.
         """
         action = self._action
-        if action is None or self._is_old(action, now_s):
-            return None
-        velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
-            action.value.astype(np.float64)
-        )
-        return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+        return None if action is None or self._is_old(action, now_s) else action.value
 
     @property
     def problem(self) -> str:
@@ -401,5 +405,5 @@ class Pac:
         horizontal = np.array(positions_m, np.float64).reshape(-1, 3)[:, :2]
         return self._parameters.scale.position_to_model(horizontal)
 
-    def _is_old(self, timed: _Timed, now_s: float) -> bool:
+    def _is_old(self, timed: _Timed[Any], now_s: float) -> bool:
         return now_s - timed.time_s > self._parameters.max_input_age_s

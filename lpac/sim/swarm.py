@@ -215,10 +215,12 @@ class ClockedPac(Pac):
             )
         return tick
 
-    def receive(self, data: bytes, now_s: float, *, sender: int | None = None) -> Rejection | None:
+    def receive(
+        self, data: bytes, now_s: float, *, sender: int | None = None, start: int = 0
+    ) -> Rejection | None:
         """See `Pac.receive`."""
         self._tell_time(now_s)
-        return super().receive(data, now_s, sender=sender)
+        return super().receive(data, now_s, sender=sender, start=start)
 
     def _tell_time(self, now_s: float) -> None:
         self.clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)

@@ -44,6 +44,14 @@ class Frame(NamedTuple):
     vehicle_s: float | None = None
 
 
+class _Newest(NamedTuple):
+    """Newest frame of a message: the vehicle's time, when it came, and by which path."""
+
+    vehicle_s: float
+    at_s: float
+    path: Hashable
+
+
 class _Sort(Enum):
     NEXT = "next"
     AGAIN = "again"
@@ -109,8 +117,8 @@ class VehicleFrames:
         self.path: Hashable = None
         self._path_at_s = -math.inf
         self._paths: dict[Hashable, _Path] = {}
-        # Of each message that has the vehicle's time: that of the newest, when it came, and whence.
-        self._newest: dict[int, tuple[float, float, Hashable]] = {}
+        # Of each message that has the vehicle's time.
+        self._newest: dict[int, _Newest] = {}
         self._latest_s = -math.inf
         # Of each content: when it was taken, by which path, and of which stream; oldest first. A
         # dict that is emptied from its front takes ever longer to find that.
@@ -120,24 +128,31 @@ class VehicleFrames:
     def take(self, frame: Frame, now_s: float) -> bool:
         """Whether it is to be taken: it is neither old nor was taken before."""
         self._forget(now_s)
-        if self._began_anew(frame, now_s):
+        newest = None if frame.vehicle_s is None else self._newest.get(frame.message_id)
+        if newest is not None and self._began_anew(frame, newest, now_s):
             self._newest.clear()
             self._latest_s = -math.inf
             self._paths.clear()
-        self._forget_paths(now_s)
+            newest = None
+        if len(self._paths) > _MOST_PATHS:
+            self._forget_paths(now_s)
         path = self._paths.get(frame.path)
         if path is None:
             path = self._paths[frame.path] = _Path()
-        back_s = self._back_s(frame)
         sort, stream = self._sort(frame, path, now_s)
-        is_old = back_s > 0.0
-        if frame.vehicle_s is None:
-            is_old = self._is_late(path) or (stream is not None and stream.is_late)
         path.heard_at_s = now_s
         second = self._this(now_s)
         second.again += sort is _Sort.AGAIN
-        if self._is_by_another(frame, back_s) and sort in (_Sort.NEXT, _Sort.OTHER):
-            second.others += 1
+        if frame.vehicle_s is None:
+            is_old = self._is_late(path) or (stream is not None and stream.is_late)
+        else:
+            # By how much the vehicle's time goes back with this frame.
+            back_s = 0.0 if newest is None else newest.vehicle_s - frame.vehicle_s
+            is_old = back_s > 0.0
+            same_time = newest is not None and back_s == 0.0 and newest.path != frame.path
+            # One vehicle would not say it so, if it does not say it again.
+            if (back_s > _BACK_S or same_time) and sort in (_Sort.NEXT, _Sort.OTHER):
+                second.others += 1
         if is_old or sort is not _Sort.NEXT:
             return False
         second.taken += 1
@@ -145,7 +160,7 @@ class VehicleFrames:
         self._taken.move_to_end(frame.content)
         if frame.vehicle_s is not None:
             second.timed += 1
-            self._newest[frame.message_id] = frame.vehicle_s, now_s, frame.path
+            self._newest[frame.message_id] = _Newest(frame.vehicle_s, now_s, frame.path)
             self._latest_s = max(self._latest_s, frame.vehicle_s)
         if frame.path != self.path and now_s - self._path_at_s > _SILENT_S:
             self.path = frame.path
@@ -155,15 +170,13 @@ class VehicleFrames:
 
     def lost(self, now_s: float) -> float:
         """The share of the frames that were lost in the last ten seconds, in steps of 5 %."""
-        taken = lost = 0
-        for second in self._within(_LOSS_S, now_s):
-            taken += second.taken
-            lost += second.lost
+        seconds = self._within(_LOSS_S, now_s)
+        taken, lost = sum([s.taken for s in seconds]), sum([s.lost for s in seconds])
         return round(20.0 * lost / (taken + lost)) / 20.0 if taken + lost >= _LEAST_FRAMES else 0.0
 
     def arrives_twice(self, now_s: float) -> bool:
         """Whether frames come again that were taken before."""
-        return sum(s.again for s in self._within(_OTHERS_S, now_s)) >= _LEAST_TWICE
+        return sum([s.again for s in self._within(_OTHERS_S, now_s)]) >= _LEAST_TWICE
 
     def has_others(self, now_s: float) -> bool:
         """Whether two vehicles seem to speak with one system id.
@@ -177,44 +190,25 @@ class VehicleFrames:
         return others >= least and others > sum(s.again for s in seconds)
 
     def _forget(self, now_s: float) -> None:
-        while self._taken:
-            content, (at_s, _, _) = next(iter(self._taken.items()))
-            if now_s - at_s <= _REMEMBERED_S:
-                return
-            del self._taken[content]
+        while self._taken and now_s - next(iter(self._taken.values()))[0] > _REMEMBERED_S:
+            self._taken.popitem(last=False)
 
     def _forget_paths(self, now_s: float) -> None:
         """Anybody can make one more."""
-        if len(self._paths) > _MOST_PATHS:
-            self._paths = {
-                key: path
-                for key, path in self._paths.items()
-                if now_s - path.heard_at_s <= _SILENT_S
-            }
+        self._paths = {
+            key: path for key, path in self._paths.items() if now_s - path.heard_at_s <= _SILENT_S
+        }
 
-    def _began_anew(self, frame: Frame, now_s: float) -> bool:
+    def _began_anew(self, frame: Frame, newest: _Newest, now_s: float) -> bool:
         """Whether the vehicle was switched on anew, or another one is there instead."""
-        newest = self._newest.get(frame.message_id)
-        if frame.vehicle_s is None or newest is None or frame.content in self._taken:
+        if frame.vehicle_s is None or frame.vehicle_s >= newest.vehicle_s:
             return False
-        silent_s = now_s - newest[1]
-        if frame.vehicle_s >= newest[0]:
+        if frame.content in self._taken:
             return False
+        silent_s = now_s - newest.at_s
         # What was sent before the silence is only late.
         may_have_started = silent_s > _SILENT_S and frame.vehicle_s < silent_s + _SILENT_S
         return may_have_started or silent_s > 2.0 * _REMEMBERED_S
-
-    def _back_s(self, frame: Frame) -> float:
-        """By how much the vehicle's time goes back with this frame."""
-        newest = self._newest.get(frame.message_id)
-        return 0.0 if frame.vehicle_s is None or newest is None else newest[0] - frame.vehicle_s
-
-    def _is_by_another(self, frame: Frame, back_s: float) -> bool:
-        """Whether one vehicle would not say it so, if it does not say it again."""
-        newest = self._newest.get(frame.message_id)
-        if frame.vehicle_s is None or newest is None:
-            return False
-        return back_s > _BACK_S or (back_s == 0.0 and newest[2] != frame.path)
 
     def _is_late(self, path: _Path) -> bool:
         """Whether what comes by this path is older than what came by another."""
@@ -265,8 +259,9 @@ class VehicleFrames:
                 self._this(now_s).lost += ahead - 1
 
     def _this(self, now_s: float) -> _Second:
-        if not self._seconds or self._seconds[-1].second != math.floor(now_s):
-            self._seconds.append(_Second(math.floor(now_s)))
+        second = math.floor(now_s)
+        if not self._seconds or self._seconds[-1].second != second:
+            self._seconds.append(_Second(second))
         return self._seconds[-1]
 
     def _within(self, seconds: int, now_s: float) -> list[_Second]:

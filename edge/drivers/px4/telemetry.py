@@ -89,6 +89,8 @@ class Px4Telemetry:
     vehicle's own clock tells how old they are, and `position_at_s` and `heartbeat_at_s` count from
     when they were due.
 
+    `messages` are the names of those that `hear` understands.
+
     Position and origin always belong together. A position that jumps is held back until the origin
     is known anew, half a second at most, and a new origin counts from the next position on.
     """
@@ -137,11 +139,7 @@ class Px4Telemetry:
             "AUTOPILOT_VERSION": self._on_autopilot_version,
             "MISSION_CURRENT": self._on_mission_current,
         }
-
-    @property
-    def messages(self) -> tuple[str, ...]:
-        """The names of the messages that `hear` understands."""
-        return tuple(self._handlers)
+        self.messages = tuple(self._handlers)
 
     def hear(self, name: str, fields: Fields, now_s: float) -> None:
         """Take in one message of the autopilot.
@@ -185,8 +183,7 @@ class Px4Telemetry:
 
     def needs_origin(self) -> bool:
         """Whether the position jumped, and an origin that is as new has not come yet."""
-        with self._lock:
-            return self._jump_at_s is not None
+        return self._jump_at_s is not None
 
     def has_twin(self, now_s: float) -> bool:
         """Whether two vehicles speak with the same system id, by their hardware ids.
@@ -388,12 +385,12 @@ class Px4Telemetry:
         if self._clock.restarts > restarts and not self._heard.armed:
             self._change(fell=self._disarmed_aloft)
         was_held_back = self._jump_at_s is not None
-        if self._is_held_back(position_m, velocity_m_s, at_s, now_s):
-            return
         heard = self._heard
-        changed = (position_m, velocity_m_s) != (heard.position_local_m, heard.velocity_local_m_s)
         between_s = max(at_s - heard.position_at_s, 0.0)
-        off_m = self._off_m(position_m, velocity_m_s, between_s, self._origin)
+        off_m = self._off_m(position_m, velocity_m_s, between_s)
+        if self._is_held_back(off_m, between_s, now_s):
+            return
+        changed = (position_m, velocity_m_s) != (heard.position_local_m, heard.velocity_local_m_s)
         # That it jumped was seen at once: the time that it was held back makes it no motion.
         unexplained = was_held_back and self._origin == heard.origin
         uncertain_s = 0.0 if unexplained else between_s
@@ -411,9 +408,7 @@ class Px4Telemetry:
             origin=self._origin,
         )
 
-    def _is_held_back(
-        self, position_m: Vector, velocity_m_s: Vector, at_s: float, now_s: float
-    ) -> bool:
+    def _is_held_back(self, off_m: Vector, between_s: float, now_s: float) -> bool:
         """Whether the position may belong to another origin than the one that is known."""
         if self._origin != self._heard.origin:
             self._jump_at_s = None
@@ -421,27 +416,18 @@ class Px4Telemetry:
             answered = self._origin_at_s > self._jump_at_s
             if answered or now_s - self._jump_at_s > _ORIGIN_ANSWER_S:
                 self._jump_at_s = None
-        else:
-            between_s = max(at_s - self._heard.position_at_s, 0.0)
-            off_m = self._off_m(position_m, velocity_m_s, between_s, self._heard.origin)
-            if _is_jump(off_m, between_s):
-                self._jump_at_s = now_s
+        elif _is_jump(off_m, between_s):
+            self._jump_at_s = now_s
         return self._jump_at_s is not None
 
-    def _off_m(
-        self,
-        position_m: Vector,
-        velocity_m_s: Vector,
-        between_s: float,
-        origin: GlobalOrigin | None,
-    ) -> Vector:
-        """How far a position from that origin lies from where motion led from the last one."""
+    def _off_m(self, position_m: Vector, velocity_m_s: Vector, between_s: float) -> Vector:
+        """Offset of a position from where motion led since the last one, whatever their origins."""
         last_m, last_m_s = self._heard.position_local_m, self._heard.velocity_local_m_s
-        last_origin = self._heard.origin
+        origin, last_origin = self._origin, self._heard.origin
         if last_m is None or last_m_s is None:
             return 0.0, 0.0, 0.0
         shift = (0.0, 0.0, 0.0)
-        if origin is not None and last_origin is not None:
+        if origin is not None and last_origin is not None and origin != last_origin:
             shift = _shift_m(last_origin, origin)
         now, last, now_m_s = position_m, last_m, velocity_m_s
         return (

@@ -1,12 +1,12 @@
 """Where the simulated world lies on the earth, and polygons on it."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 from edge.core import F64
+from edge.core.frames import m_per_deg
 
 
 class WorldOrigin(NamedTuple):
@@ -18,7 +18,7 @@ class WorldOrigin(NamedTuple):
 
     def to_global(self, position_m: Sequence[float] | F64) -> tuple[float, float, float]:
         """Latitude and longitude, deg, and height above mean sea level, m, of a world position."""
-        north_m, east_m = _m_per_deg(self.latitude_deg)
+        north_m, east_m = m_per_deg(self.latitude_deg)
         return (
             self.latitude_deg + float(position_m[0]) / north_m,
             self.longitude_deg + float(position_m[1]) / east_m,
@@ -27,7 +27,7 @@ class WorldOrigin(NamedTuple):
 
     def to_world(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """North and east of a place, m."""
-        north_m, east_m = _m_per_deg(self.latitude_deg)
+        north_m, east_m = m_per_deg(self.latitude_deg)
         return (
             (latitude_deg - self.latitude_deg) * north_m,
             (longitude_deg - self.longitude_deg) * east_m,
@@ -52,17 +52,6 @@ class FencePolygon:
             if crosses and north_m < n_1 + (east_m - e_1) * (n_2 - n_1) / (e_2 - e_1):
                 inside = not inside
         return inside
-
-
-@cache
-def _m_per_deg(latitude_deg: float) -> tuple[float, float]:
-    """Lengths of a degree on the WGS84 ellipsoid; good to 1 cm within 1 km."""
-    semi_major_m, eccentricity_2 = 6378137.0, 6.69437999014e-3
-    latitude = math.radians(latitude_deg)
-    w_2 = 1.0 - eccentricity_2 * math.sin(latitude) ** 2
-    meridian_m = semi_major_m * (1.0 - eccentricity_2) / w_2**1.5
-    normal_m = semi_major_m / math.sqrt(w_2) * math.cos(latitude)
-    return math.radians(meridian_m), math.radians(normal_m)
 
 
 @lru_cache

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from edge.core import F64
-from edge.core.frames import LocalTransform, MissionFrame, ModelScale
+from edge.core.frames import LocalTransform, MissionFrame, ModelScale, m_per_deg
 
 EARTH_RADIUS_M = 6.371e6
 
@@ -239,6 +239,17 @@ def test_a_place_of_the_mission_frame_is_found_on_the_earth(
     frame = MissionFrame(39.95, -75.16, heading_rad)
     origin_m = frame.relative_to(*frame.to_global_deg(x_m, y_m)).local_origin_m
     np.testing.assert_allclose(origin_m, (x_m, y_m, 0.0), atol=1e-6)
+
+
+@given(number(-45.0, 45.0), number(0.0, math.tau))
+def test_lengths_of_a_degree_hold_for_a_kilometre(latitude_deg: float, azimuth: float) -> None:
+    north_m, east_m = m_per_deg(latitude_deg)
+    for distance_m, off_m in ((100.0, 1e-3), (1000.0, 0.1)):
+        x_m, y_m = distance_m * math.sin(azimuth), distance_m * math.cos(azimuth)
+        frame = MissionFrame(latitude_deg, 7.0, 0.0)
+        place_deg = latitude_deg + y_m / north_m, 7.0 + x_m / east_m
+        there_m = frame.relative_to(*place_deg).local_origin_m
+        assert math.dist(there_m[:2], (x_m, y_m)) < off_m
 
 
 def test_a_wrong_local_origin_says_what_is_allowed() -> None:
