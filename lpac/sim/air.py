@@ -99,22 +99,24 @@ class Radio:
         own = sender.station
         key = f"ground/{topic.name}" if topic.sender == "ground" else f"robot/{own}/{topic.name}"
         self.sent_bytes += len(data)
+        air, now_s = self.air, self.schedule.monotonic_s()
         for receiver in self._links:
             if receiver is sender or not receiver.listens(topic) or len(data) > topic.limit_bytes:
                 continue
             # All are drawn for each receiver: one chance alone does not change those after it.
-            lost, twice, *travels = self.rng.random(4).tolist()
+            lost, twice, travel, second_travel = self.rng.random(4).tolist()
             if self._apart(own, receiver.station):
                 continue
-            if lost < self.air.loss:
+            if lost < air.loss:
                 self.lost += 1
                 continue
             arrives = data
-            if self.air.corruption and self.rng.random() < self.air.corruption:
+            if air.corruption and self.rng.random() < air.corruption:
                 arrives = _corrupted(data, int(self.rng.integers(8 * len(data))))
-            for travel in travels[: 2 if twice < self.air.duplication else 1]:
-                at_s = self.schedule.monotonic_s() + self.air.delay_s * (0.5 + travel)
-                self.schedule.at(at_s, partial(receiver.hear, topic, key, arrives))
+            hear = partial(receiver.hear, topic, key, arrives)
+            self.schedule.at(now_s + air.delay_s * (0.5 + travel), hear)
+            if twice < air.duplication:
+                self.schedule.at(now_s + air.delay_s * (0.5 + second_travel), hear)
 
     def _apart(self, sender: int, receiver: int) -> bool:
         if self.air.keeps_apart(sender, receiver):

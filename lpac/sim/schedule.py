@@ -40,8 +40,9 @@ class Schedule:
 
     def run_until(self, time_s: float) -> None:
         """Let that much time pass."""
-        while self._due and self._due[0][0] <= time_s:
-            self._now_s, _, do = heapq.heappop(self._due)
+        due = self._due
+        while due and due[0][0] <= time_s:
+            self._now_s, _, do = heapq.heappop(due)
             do()
         self._now_s = max(self._now_s, time_s)
 

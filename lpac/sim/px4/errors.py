@@ -55,16 +55,16 @@ def draw_bias_m(share: float, bearing_rad: float) -> tuple[float, float]:
 
 
 class Wave(NamedTuple):
-    """Something that walks to and fro around where it was at time 0."""
+    """Sine around where it was at time 0; `began` is the sine of its phase."""
 
     amplitude: float
     rate_rad_s: float
     phase_rad: float
+    began: float
 
     def at(self, time_s: float) -> float:
         """How far it has walked since time 0."""
-        now_rad = self.rate_rad_s * time_s + self.phase_rad
-        return self.amplitude * (math.sin(now_rad) - math.sin(self.phase_rad))
+        return self.amplitude * (math.sin(self.rate_rad_s * time_s + self.phase_rad) - self.began)
 
     def about(self, time_s: float) -> float:
         """How far it is from its middle."""
@@ -86,7 +86,7 @@ class Errors:
         self._height = [_draw_wave(own, OWN_HEIGHT_M, _OWN_HEIGHT_PERIODS_S) for _ in range(2)]
         sign = 1.0 if common.uniform() < 0.5 else -1.0
         self._height.append(
-            Wave(sign * COMMON_HEIGHT_M, math.tau / COMMON_HEIGHT_PERIOD_S, phase_rad=0.0)
+            Wave(sign * COMMON_HEIGHT_M, math.tau / COMMON_HEIGHT_PERIOD_S, 0.0, 0.0)
         )
 
         self._heading_rad = float(own.uniform(-COMPASS_RAD, COMPASS_RAD))
@@ -172,7 +172,12 @@ class Errors:
 
     def height_m(self, time_s: float) -> float:
         """By how much lower than at the start the vehicle takes itself to be, where it is."""
-        return math.fsum([wave.at(time_s) for wave in self._height])
+        return math.fsum(
+            [
+                a * (math.sin(rate * time_s + phase) - began)
+                for a, rate, phase, began in self._height
+            ]
+        )
 
     def heading_rad(self, time_s: float) -> float:
         """By how much the compass is wrong; the estimator may notice in flight, in one go."""
@@ -192,9 +197,10 @@ class Errors:
 
 def _sum_about(waves: list[Wave], time_s: float) -> float:
     """How far the sum of the waves is from its middle."""
-    return math.fsum([a * math.sin(rate * time_s + phase) for a, rate, phase in waves])
+    return math.fsum([a * math.sin(rate * time_s + phase) for a, rate, phase, _ in waves])
 
 
 def _draw_wave(rng: np.random.Generator, amplitude: float, periods_s: tuple[float, float]) -> Wave:
     rate_rad_s = math.tau / float(rng.uniform(*periods_s))
-    return Wave(amplitude, rate_rad_s, float(rng.uniform(0.0, math.tau)))
+    phase_rad = float(rng.uniform(0.0, math.tau))
+    return Wave(amplitude, rate_rad_s, phase_rad, math.sin(phase_rad))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 from edge.core.vehicle import Vector
-from lpac.sim.px4.vector import ZERO, level, minus, plus, times
+from lpac.sim.px4.vector import ZERO, level, minus, plus, times, total
 
 NOISE_M = (0.15, 0.15, 0.1)
 NOISE_TIME_S = 10.0
@@ -107,7 +107,7 @@ class Estimator:
     @property
     def position_valid(self) -> bool:
         """Whether the estimator vouches for its position."""
-        return self.is_ready and self.is_held
+        return self._time_s >= self._ready_after_s and self._is_held(DEAD_RECKONING_S)
 
     def _is_held(self, without_gps_s: float) -> bool:
         is_back = self._time_s >= self._gps_back_at_s
@@ -132,16 +132,18 @@ class Estimator:
             self._followed_once = self._followed_once or any(off_m) or any(off_m_s)
             if self._followed_once:
                 self._follow(off_m, off_m_s, dt_s)
+            if self._gps_lost_since_s < math.inf:
+                if self._gps_lost_since_s > -math.inf and not self.position_valid:
+                    self._gps_back_at_s = time_s + GPS_REGAIN_S
+                self._gps_lost_since_s = math.inf
+            self._drift_m = ZERO
         else:
             # Without it, gravity tells the tilt.
             self._tilt_error_m_s2 = ZERO
             self._followed_m = plus(self._followed_m, times(self.velocity_error_m_s, dt_s))
-        if not has_gps:
             self._gps_lost_since_s = min(self._gps_lost_since_s, time_s)
-        elif not self.has_gps:
-            if self._gps_lost_since_s > -math.inf and not self.position_valid:
-                self._gps_back_at_s = time_s + GPS_REGAIN_S
-            self._gps_lost_since_s = math.inf
+            step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
+            self._drift_m = plus(self._drift_m, level(times(draws[3:6], step_m)))
         decay = dt_s / NOISE_TIME_S
         kept, grows = 1.0 - decay, math.sqrt(2.0 * decay)
         north_m, east_m, down_m = self._noise_m
@@ -150,12 +152,7 @@ class Estimator:
             east_m * kept + NOISE_M[1] * draws[1] * grows,
             down_m * kept + NOISE_M[2] * draws[2] * grows,
         )
-        if self.has_gps:
-            self._drift_m = ZERO
-        else:
-            step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
-            self._drift_m = plus(self._drift_m, level(times(draws[3:6], step_m)))
-        self.error_m = plus(plus(self._noise_m, self._drift_m), self._followed_m)
+        self.error_m = total(self._noise_m, self._drift_m, self._followed_m)
 
     def _follow(self, off_m: Vector, off_m_s: Vector, dt_s: float) -> None:
         """Go after a fix that lies; where it is too far off to be true, wait, then start over."""

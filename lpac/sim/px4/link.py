@@ -235,22 +235,23 @@ class Px4Link:
             self._told.append(self._event(event))
             self._send(self._told[-1])
             self._texts.append((vehicle.time_s, event))
-        self._send_texts()
+        if self._texts:
+            self._send_texts()
         if vehicle.parameters != self._parameters_told:
             for name, value in vehicle.parameters.items():
                 if value != self._parameters_told.get(name):
                     self._send_parameter(name)
             self._parameters_told = dict(vehicle.parameters)
-        for name in self._parameters_to_send[:PARAMETERS_AT_ONCE]:
-            self._send_parameter(name)
-        del self._parameters_to_send[:PARAMETERS_AT_ONCE]
+        if self._parameters_to_send:
+            for name in self._parameters_to_send[:PARAMETERS_AT_ONCE]:
+                self._send_parameter(name)
+            del self._parameters_to_send[:PARAMETERS_AT_ONCE]
         now_s = vehicle.time_s + 1e-6
-        for message, due_s in self._due_s.items():
-            if due_s <= now_s:
-                # A late message does not make the next one early.
-                interval_s = self._intervals_s[message]
-                self._due_s[message] = max(due_s + interval_s, now_s)
-                self._send_now(message)
+        for message in [each for each, due_s in self._due_s.items() if due_s <= now_s]:
+            # A late message does not make the next one early.
+            next_s = self._due_s[message] + self._intervals_s[message]
+            self._due_s[message] = max(next_s, now_s)
+            self._send_now(message)
         messages, self._out = self._out, []
         for message in messages:
             self._link_number += 1
@@ -510,7 +511,7 @@ class Px4Link:
         latitude, longitude, altitude_mm = _as_integers(vehicle.global_position)
         home = vehicle.global_home
         relative_mm = 0 if home is None else altitude_mm - round(home[2] * 1e3)
-        velocity_cm_s = np.rint(vehicle.estimated_velocity_m_s * 100.0).astype(int).tolist()
+        velocity_cm_s = [round(each_m_s * 100.0) for each_m_s in vehicle.estimate_m_s()]
         heading_cdeg = round(math.degrees(vehicle.estimated_heading_rad) * 100.0) % 36000
         return mavlink.MAVLink_global_position_int_message(
             self._boot_ms(),
@@ -527,13 +528,13 @@ class Px4Link:
         vehicle = self.vehicle
         return mavlink.MAVLink_local_position_ned_message(
             self._boot_ms(),
-            *vehicle.local_position_m.tolist(),
-            *vehicle.estimated_velocity_m_s.tolist(),
+            *minus(vehicle.estimate_m(), vehicle.estimator_origin_m.tolist()),
+            *vehicle.estimate_m_s(),
         )
 
     def _vfr_hud(self) -> Any:
         vehicle = self.vehicle
-        north_m_s, east_m_s, down_m_s = vehicle.estimated_velocity_m_s.tolist()
+        north_m_s, east_m_s, down_m_s = vehicle.estimate_m_s()
         return mavlink.MAVLink_vfr_hud_message(
             math.nan,
             math.hypot(north_m_s, east_m_s),
@@ -553,7 +554,7 @@ class Px4Link:
             mavlink.MAV_FRAME_BODY_FRD,
             *vehicle.local_position_m.tolist(),
             level,
-            *self._body(vehicle.estimated_velocity_m_s.tolist()),
+            *self._body(vehicle.estimate_m_s()),
             0.0,
             0.0,
             vehicle.yaw_rate_rad_s,

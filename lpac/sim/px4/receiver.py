@@ -7,7 +7,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.vehicle import Vector
-from lpac.sim.px4.vector import ZERO, level, minus, plus, times
+from lpac.sim.px4.vector import ZERO, level, minus, plus, times, total
 
 
 def _zeros() -> F64:
@@ -38,15 +38,23 @@ class Receiver:
             self._stuck_at_m = None
         elif self._stuck_at_m is None:
             self._stuck_at_m = fix_m()
-        self._crept_m = plus(self._crept_m, times(self.creep_m_s.tolist(), dt_s))
+        creep_m_s = self.creep_m_s.tolist()
+        if any(creep_m_s):
+            self._crept_m = plus(self._crept_m, times(creep_m_s, dt_s))
         if self.scatter_m:
             self._scattered_m = level(times(rng.standard_normal(3).tolist(), self.scatter_m))
+
+    @property
+    def lies(self) -> bool:
+        """Whether the place or the velocity that it tells is wrong."""
+        misplaces = (self._crept_m, self._scattered_m) != (ZERO, ZERO)
+        return self._stuck_at_m is not None or misplaces or any(self.velocity_bias_m_s.tolist())
 
     def place_m(self, true_m: Vector) -> Vector:
         """The place that it tells; `true_m` if it is honest."""
         if self._stuck_at_m is not None:
             return self._stuck_at_m
-        return plus(plus(true_m, self._crept_m), self._scattered_m)
+        return total(true_m, self._crept_m, self._scattered_m)
 
     def velocity_m_s(self, true_m_s: Vector) -> Vector:
         """The velocity that it tells."""
@@ -57,3 +65,7 @@ class Receiver:
     def off_m(self, true_m: Vector) -> Vector:
         """How far its place is off in the plane. Heights go by the barometer."""
         return level(minus(self.place_m(true_m), true_m))
+
+    def off_m_s(self, true_m_s: Vector) -> Vector:
+        """How far its velocity is off in the plane."""
+        return level(minus(self.velocity_m_s(true_m_s), true_m_s))

@@ -22,6 +22,11 @@ def plus(a: Sequence[float], b: Sequence[float]) -> Vector:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
+def total(a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> Vector:
+    """(a + b) + c."""
+    return a[0] + b[0] + c[0], a[1] + b[1] + c[1], a[2] + b[2] + c[2]
+
+
 def minus(a: Sequence[float], b: Sequence[float]) -> Vector:
     """a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]

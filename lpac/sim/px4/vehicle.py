@@ -48,7 +48,7 @@ from lpac.sim.px4.modes import (
 )
 from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.receiver import Receiver
-from lpac.sim.px4.vector import ZERO, level, minus, plus, times, vector
+from lpac.sim.px4.vector import ZERO, level, minus, plus, times, total, vector
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
@@ -85,7 +85,7 @@ ASSUMED_OHM = 0.02
 # What the receiver of PX4's own simulator says of itself.
 GPS_ACCURACY_M, GPS_ACCURACY_M_S, GPS_SATELLITES = (0.9, 1.78), 0.4, 10
 # No receiver tells the same place twice.
-FIX_NOISE_M, FIX_NOISE_RAD_S = 0.02, np.array([7.3, 9.1, 5.7])
+FIX_NOISE_M, FIX_NOISE_RAD_S = 0.02, (7.3, 9.1, 5.7)
 # How old a fix is when it is told.
 GPS_LAG_S = 0.1
 
@@ -125,6 +125,10 @@ class SimulatedSensor(StrEnum):
     BATTERY = "battery"
 
 
+_ALWAYS_THERE = (
+    Component.BAROMETER, Component.BATTERY, Component.LOCAL_POSITION_ESTIMATE, Component.COMPASS,
+    Component.ACCELEROMETER, Component.GYROSCOPE,
+)  # fmt: skip
 _ARMED_BY, _DISARMED_BY = 9489139, 16017271
 _BY_COMMAND, _BY_LANDING, _BEFORE_FLIGHT, _BY_FAILSAFE = 4, 6, 7, 14
 _ARMING_DENIED, _DISARMING_DENIED = 133277, 9091509
@@ -285,19 +289,21 @@ class Px4Vehicle:
     @property
     def estimated_position_m(self) -> F64:
         """(3,), world frame: where the vehicle takes itself to be."""
-        return np.array(self._estimated_m())
+        return np.array(self.estimate_m())
 
-    def _estimated_m(self) -> Vector:
+    def estimate_m(self) -> Vector:
+        """Estimated position as plain floats."""
         if self._frozen is not None:
             return self._frozen[0]
-        return plus(plus(self._position_m, self._shared_error_m()), self.estimator.error_m)
+        return total(self._position_m, self._shared_error_m(), self.estimator.error_m)
 
     @property
     def estimated_velocity_m_s(self) -> F64:
         """(3,), world frame: how fast the vehicle takes itself to be."""
-        return np.array(self._estimated_m_s())
+        return np.array(self.estimate_m_s())
 
-    def _estimated_m_s(self) -> Vector:
+    def estimate_m_s(self) -> Vector:
+        """Estimated velocity as plain floats."""
         if self._frozen is not None:
             return self._frozen[1]
         return plus(self._velocity_m_s, self._velocity_error_m_s)
@@ -315,7 +321,7 @@ class Px4Vehicle:
     @property
     def global_position(self) -> tuple[float, float, float]:
         """The estimate: latitude and longitude, deg, height above mean sea level, m."""
-        return self._world.to_global(self._estimated_m())
+        return self._world.to_global(self.estimate_m())
 
     @property
     def global_fix(self) -> tuple[float, float, float]:
@@ -331,16 +337,18 @@ class Px4Vehicle:
         return self.receiver.velocity_m_s(self._velocity_m_s)
 
     def _honest_fix_m(self) -> Vector:
-        noise_m = vector(FIX_NOISE_M * np.sin(self.time_s * FIX_NOISE_RAD_S))
+        noise_m: Sequence[float] = [
+            FIX_NOISE_M * math.sin(self.time_s * rate_rad_s) for rate_rad_s in FIX_NOISE_RAD_S
+        ]
         if self._errors is not None:
             noise_m = plus(noise_m, self._errors.fix_m(self.time_s))
         late_m = minus(self._position_m, times(self._velocity_m_s, GPS_LAG_S))
         honest_m = plus(late_m, self._shared_error_m())
-        return plus(plus(honest_m, self.gps_jump_m.tolist()), noise_m)
+        return total(honest_m, self.gps_jump_m.tolist(), noise_m)
 
     def _shared_error_m(self) -> Vector:
         """Error that fix and estimate have in common."""
-        return plus(plus(self.gps_bias_m.tolist(), self._walk_m), self.gps_offset_m.tolist())
+        return total(self.gps_bias_m.tolist(), self._walk_m, self.gps_offset_m.tolist())
 
     @property
     def gps_accuracy_m(self) -> tuple[float, float, float]:
@@ -456,7 +464,7 @@ class Px4Vehicle:
         self._lift_began_s = None
         self._rc_at_arming = self.rc_connected
         self.failsafe.reset()
-        self.home_m = self._estimated_m()
+        self.home_m = self.estimate_m()
         text = "Armed by external command\t"
         self._say(_ARMED_BY, Level.INFO, text, bytes([_BY_COMMAND]))
         return MavResult.ACCEPTED
@@ -552,9 +560,10 @@ class Px4Vehicle:
         if not self.estimate_frozen:
             self._frozen = None
         elif self._frozen is None:
-            self._frozen = self._estimated_m(), self._estimated_m_s()
+            self._frozen = self.estimate_m(), self.estimate_m_s()
         self.time_s += dt_s
-        self._watch_sensors()
+        if self.dead_sensors or self._dead_since_s:
+            self._watch_sensors()
         self._estimate(dt_s)
         if any(self.gps_drift_m_s.tolist()):
             self.gps_offset_m = self.gps_offset_m + self.gps_drift_m_s * dt_s
@@ -565,12 +574,13 @@ class Px4Vehicle:
             self._walk_m = minus(errs_m, self.gps_bias_m.tolist())
             self._compass_rad = self._errors.heading_rad(self.time_s) + self.compass_jump_rad
             self._air_m_s = plus(self._air_m_s, self._errors.wind_m_s(self.time_s))
+            lifted = min(-self._position_m[2] / _ERRS_FROM_M, 1.0)
             # Who stands on the ground is known to.
-            lifted = min(max(-self._position_m[2] / _ERRS_FROM_M, 0.0), 1.0)
-            errors_m_s = times(self._errors.velocity_m_s(self.time_s), lifted)
-            self._velocity_error_m_s = plus(self._velocity_error_m_s, errors_m_s)
+            if lifted > 0.0:
+                errors_m_s = times(self._errors.velocity_m_s(self.time_s), lifted)
+                self._velocity_error_m_s = plus(self._velocity_error_m_s, errors_m_s)
         if self.home_m is None and self.estimator.has_attitude and self.estimator.has_gps:
-            self.home_m = self._estimated_m()
+            self.home_m = self.estimate_m()
         if self.armed:
             drain = 1.0 if self._errors is None else self._errors.drain
             drained = drain * self.current_a / (IDLE_A + HOVER_A) * dt_s
@@ -592,9 +602,11 @@ class Px4Vehicle:
         has_gps = not self.gps_lost and SimulatedSensor.GPS not in self.dead_sensors
         has_gps = has_gps and bool(self.parameters["EKF2_GPS_CTRL"])
         self.receiver.step(dt_s, self._honest_fix_m, self._rng)
-        told_m = plus(self._position_m, self._shared_error_m())
-        off_m = plus(self.gps_jump_m.tolist(), self.receiver.off_m(told_m))
-        off_m_s = level(minus(self.fix_velocity_m_s, self._velocity_m_s))
+        off_m, off_m_s = vector(self.gps_jump_m), ZERO
+        if self.receiver.lies:
+            told_m = plus(self._position_m, self._shared_error_m())
+            off_m = plus(off_m, self.receiver.off_m(told_m))
+            off_m_s = self.receiver.off_m_s(self._velocity_m_s)
         self.estimator.step(self.time_s, dt_s, has_gps, off_m, off_m_s, draws[:6])
         decay = dt_s / VERTICAL_DRIFT_TIME_S
         grows_m_s = VERTICAL_DRIFT_M_S * draws[6] * math.sqrt(2.0 * decay)
@@ -605,17 +617,16 @@ class Px4Vehicle:
             self._gust_m_s = plus(times(self._gust_m_s, 1.0 - decay), pushes_m_s)
 
     def _watch_sensors(self) -> None:
-        if self.dead_sensors or self._dead_since_s:
-            self._dead_since_s = {
-                sensor: self._dead_since_s.get(sensor, self.time_s) for sensor in self.dead_sensors
-            }
+        self._dead_since_s = {
+            sensor: self._dead_since_s.get(sensor, self.time_s) for sensor in self.dead_sensors
+        }
 
     # Checks
 
     def _run_checks(self, *, asked: bool = False) -> None:
         used_gps = Component.GPS in self._reporter.newest.present
         self._events += self._reporter.update(self._checks(), self.time_s, asked=asked)
-        if not self.armed and not self.estimator.has_gps and not self.position_valid:
+        if not self.armed and not self.estimator.has_gps and not self.estimator.position_valid:
             self.home_m = None
         uses_gps = self.estimator.uses_gps
         if self.armed and uses_gps is not used_gps:
@@ -626,14 +637,9 @@ class Px4Vehicle:
     def _checks(self) -> HealthReport:
         """All that is wrong now, in PX4's order."""
         parameters = self.parameters
-        is_there = {
-            Component.BAROMETER,
-            Component.BATTERY,
-            Component.LOCAL_POSITION_ESTIMATE,
-            Component.COMPASS,
-            Component.ACCELEROMETER,
-            Component.GYROSCOPE,
-        }
+        rc_heard, ground_station_lost = self.rc_heard, self._ground_station_lost()
+        position_valid = self.estimator.position_valid
+        is_there = set(_ALWAYS_THERE)
         if self.estimator.uses_gps:
             is_there.add(Component.GPS)
         if (
@@ -642,9 +648,9 @@ class Px4Vehicle:
             or self.time_s - self._disarmed_at_s < LOG_ENDS_S
         ):
             is_there.add(Component.LOGGING)
-        if self.rc_heard:
+        if rc_heard:
             is_there.add(Component.REMOTE_CONTROL)
-        if not self._ground_station_lost():
+        if not ground_station_lost:
             is_there.add(Component.COMMUNICATION_LINKS)
         required = int(parameters["NAV_DLL_ACT"]) > 0
         # In flight a battery does not get better.
@@ -658,13 +664,13 @@ class Px4Vehicle:
             (not self.estimator.has_gps and not self.armed, checks.GPS_FIX_TOO_LOW),
             (self.mode in PREVENT_ARMING and not self.armed, checks.MODE_PREVENTS_ARMING),
             (not self.estimator.has_attitude, checks.NO_ATTITUDE),
-            (not self.position_valid, checks.NO_LOCAL_POSITION),
-            (not self.position_valid, checks.NO_GLOBAL_POSITION),
+            (not position_valid, checks.NO_LOCAL_POSITION),
+            (not position_valid, checks.NO_GLOBAL_POSITION),
             (True, checks.NO_MISSION),
             (not self._offboard_signal(), checks.NO_OFFBOARD_SIGNAL),
             (self.home_m is None and self.estimator.is_ready, checks.NO_HOME),
             (
-                not self.rc_heard,
+                not rc_heard,
                 checks.MANUAL_CONTROL_DISABLED
                 if self._no_manual_control
                 else checks.NO_MANUAL_CONTROL,
@@ -673,7 +679,7 @@ class Px4Vehicle:
             (self.silent_s(SimulatedSensor.BATTERY) > BATTERY_TIMEOUT_S, checks.BATTERY_SILENT),
             (parameters["GF_ACTION"] > 0 and self._is_outside_fence(), checks.FENCE_BREACHED),
             (
-                self._ground_station_lost(),
+                ground_station_lost,
                 checks.GROUND_STATION_REQUIRED if required else checks.NO_GROUND_STATION,
             ),
         )
@@ -687,7 +693,7 @@ class Px4Vehicle:
     def _offboard_signal(self) -> bool:
         """Whether setpoints come, and the vehicle knows what it needs to follow them."""
         fresh = self.time_s - self._setpoint_at_s <= self.parameters["COM_OF_LOSS_T"]
-        return fresh and self.position_valid
+        return fresh and self.estimator.position_valid
 
     def _ground_station_lost(self) -> bool:
         return self.time_s - self._ground_station_at_s > self.parameters["COM_DL_LOSS_T"]
@@ -719,7 +725,7 @@ class Px4Vehicle:
             self.time_s,
             self.parameters["COM_FAIL_ACT_T"],
             intended_mode=self.intended_mode,
-            position_valid=self.position_valid,
+            position_valid=self.estimator.position_valid,
         )
         action = self.failsafe.action
         if action > before:
@@ -760,7 +766,7 @@ class Px4Vehicle:
     def _on_offboard_loss(self) -> FailsafeAction:
         if self.intended_mode is not Px4Mode.OFFBOARD or self._offboard_signal():
             return FailsafeAction.NONE
-        if not self.position_valid:
+        if not self.estimator.position_valid:
             return FailsafeAction.DESCEND
         setting = int(self.parameters["COM_OBL_RC_ACT"])
         if setting in OFFBOARD_LOSS_ACTIONS:
@@ -770,13 +776,10 @@ class Px4Vehicle:
         return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_RCL_ACT"]), FailsafeAction.NONE)
 
     def _on_manual_control_loss(self) -> FailsafeAction:
+        if not self._rc_at_arming or self.rc_heard or self._no_manual_control:
+            return FailsafeAction.NONE
         excepted = {Px4Mode.HOLD: 2, Px4Mode.OFFBOARD: 4}.get(self.intended_mode, 0)
-        if (
-            not self._rc_at_arming
-            or self.rc_heard
-            or self._no_manual_control
-            or int(self.parameters["COM_RCL_EXCEPT"]) & excepted
-        ):
+        if int(self.parameters["COM_RCL_EXCEPT"]) & excepted:
             return FailsafeAction.NONE
         return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_RCL_ACT"]), FailsafeAction.NONE)
 
@@ -786,9 +789,10 @@ class Px4Vehicle:
         return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_DLL_ACT"]), FailsafeAction.NONE)
 
     def _on_battery(self) -> FailsafeAction:
-        setting, warning = int(self.parameters["COM_LOW_BAT_ACT"]), self.battery_warning
+        warning = self.battery_warning
         if warning == 1:
             return FailsafeAction.NONE
+        setting = int(self.parameters["COM_LOW_BAT_ACT"])
         if warning == 2 or setting not in (2, 3):
             return FailsafeAction.WARN
         return FailsafeAction.RETURN if setting == 3 and warning == 3 else FailsafeAction.LAND
@@ -808,7 +812,7 @@ class Px4Vehicle:
         return FENCE_ACTIONS.get(int(self.parameters["GF_ACTION"]), FailsafeAction.NONE)
 
     def _is_outside_fence(self) -> bool:
-        estimate_m = self._estimated_m()
+        estimate_m = self.estimate_m()
         if self.home_m is not None:
             north_m, east_m, down_m = minus(estimate_m, self.home_m)
             radius_m = self.parameters["GF_MAX_HOR_DIST"]
@@ -822,13 +826,13 @@ class Px4Vehicle:
         return False
 
     def _on_position_loss(self) -> FailsafeAction:
-        lost = self.intended_mode in NEED_POSITION and not self.position_valid
+        lost = self.intended_mode in NEED_POSITION and not self.estimator.position_valid
         return FailsafeAction.DESCEND if lost else FailsafeAction.NONE
 
     # Motion
 
     def _home_down_m(self) -> float:
-        home_m = self._estimated_m() if self.home_m is None else self.home_m
+        home_m = self.estimate_m() if self.home_m is None else self.home_m
         return home_m[2]
 
     def _move(self, dt_s: float) -> None:
@@ -957,7 +961,7 @@ class Px4Vehicle:
     def _follow(self, setpoint: Px4Setpoint) -> tuple[Vector, float, float]:
         parameters = self.parameters
         gain, gain_down = parameters["MPC_XY_P"], parameters["MPC_Z_P"]
-        here_m = minus(self._estimated_m(), self.estimator_origin_m.tolist())
+        here_m = minus(self.estimate_m(), self.estimator_origin_m.tolist())
         off_north, off_east, off_down = minus(setpoint.position_m.tolist(), here_m)
         to_north, to_east, to_down = setpoint.velocity_m_s.tolist()
         north, east = _shorten(
@@ -977,12 +981,12 @@ class Px4Vehicle:
             north, east, _ = plus(self._velocity_m_s, self._velocity_error_m_s)
             if math.hypot(north, east) > STOPPED_M_S:
                 return ZERO
-            self._hold_m = self._estimated_m()
+            self._hold_m = self.estimate_m()
         return self._toward(self._hold_m)
 
     def _climb(self) -> Vector:
         north, east, _ = self._hold()
-        error_m = self._estimated_m()[2] - self._takeoff_down_m
+        error_m = self.estimate_m()[2] - self._takeoff_down_m
         if error_m < ARRIVED_M and self._took_off:
             self._set_intended_mode(Px4Mode.HOLD)
         speed_m_s = min(error_m * self.parameters["MPC_Z_P"], self.parameters["MPC_TKO_SPEED"])
@@ -999,7 +1003,7 @@ class Px4Vehicle:
     def _return(self) -> Vector:
         """Climb to the return altitude, fly home, land."""
         assert self.home_m is not None
-        off_north_m, off_east_m, height_m = minus(self.home_m, self._estimated_m())
+        off_north_m, off_east_m, height_m = minus(self.home_m, self.estimate_m())
         if math.hypot(off_north_m, off_east_m) < 1.0:
             north, east, _ = self._toward(self.home_m)
             return north, east, self._descent_m_s(height_m)
@@ -1011,7 +1015,7 @@ class Px4Vehicle:
         return north, east, 0.0
 
     def _toward(self, target_m: Vector) -> Vector:
-        off_north, off_east, off_down = minus(target_m, self._estimated_m())
+        off_north, off_east, off_down = minus(target_m, self.estimate_m())
         gain, gain_down = self.parameters["MPC_XY_P"], self.parameters["MPC_Z_P"]
         north, east = _shorten(gain * off_north, gain * off_east, self.parameters["MPC_XY_CRUISE"])
         return north, east, gain_down * off_down
