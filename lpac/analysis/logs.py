@@ -186,7 +186,8 @@ class _LogReader:
         self._statuses: dict[Program, dict[int, LoggedStatus]] = defaultdict(dict)
         # program -> what its clock said when it had begun, by each status
         self._own_starts_s: dict[Program, list[float]] = defaultdict(list)
-        self._fences: dict[str, Fence] = {}
+        # The last fence, as it was logged, and as it was understood.
+        self._fence: tuple[object, Fence | None] = None, None
         # program -> when the ground heard it, less its uptime
         self._heard: dict[Program, list[float]] = defaultdict(list)
         # program -> as the columns of `Received`, in the robot's clock
@@ -324,13 +325,10 @@ class _LogReader:
             },
             "status",
         )
-        if fence is None:
-            return said
-        # They are all the same, and there are very many.
-        text = json.dumps(fence)
-        if text not in self._fences:
-            self._fences[text] = _known(Fence, fence, "fence")
-        return replace(said, fence=self._fences[text])
+        # Nearly all have the same, and there are very many.
+        if fence != self._fence[0]:
+            self._fence = fence, None if fence is None else _known(Fence, fence, "fence")
+        return replace(said, fence=self._fence[1])
 
     def logs(self) -> Logs:
         logs = self._logs

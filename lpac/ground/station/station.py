@@ -843,7 +843,7 @@ def _hears_ground(status: RobotStatus) -> bool:
 def _commonest(values: Iterable[T | None]) -> T | None:
     """Value of most of those that have one; of equals the first."""
     said = Counter(value for value in values if value)
-    return next((value for value, _ in said.most_common(1)), None)
+    return max(said, key=said.__getitem__, default=None)
 
 
 def _is_at(status: RobotStatus, place: Place) -> bool:
