@@ -21,11 +21,12 @@ from edge.flight.state import (
     in_air,
     is_silent,
 )
-from edge.flight.transitions import TRANSITIONS, Transition
+from edge.flight.transitions import TRANSITIONS, Transition, by_state
 from edge.messages.codes import Reason, Refusal, RefusalCode
 from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, Order, OrderKind
 
 _S = FlightState
+ROWS = by_state(TRANSITIONS)
 
 # PX4 wants a setpoint stream before offboard, and earlier commands are carried out meanwhile.
 _STREAM_S = 0.5
@@ -161,9 +162,8 @@ def _as_needed(state: FlightState, vehicle: VehicleState) -> bool:
 
 
 def _first_row(tick: Tick, ordered: OrderKind | None) -> tuple[Transition | None, str]:
-    state, orders = tick.flight.state, (None, ordered)
-    for row in TRANSITIONS:
-        if state in row.sources and row.order in orders:
+    for row in ROWS[tick.flight.state]:
+        if row.order is None or row.order == ordered:
             reason = row.why(tick)
             if reason is not None:
                 return row, reason

@@ -6,7 +6,7 @@ table to people.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
@@ -469,3 +469,11 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition((_S.LANDED,), _S.PREFLIGHT, _R.ENABLED, "enabled, and the ground commands nothing",
                _may_fly_again),
 )  # fmt: skip
+
+
+Rows = Mapping[FlightState, Sequence[Transition]]
+
+
+def by_state(rows: Sequence[Transition]) -> Rows:
+    """Rows that apply in each state, in their order."""
+    return {state: [row for row in rows if state in row.sources] for state in FlightState}

@@ -368,8 +368,11 @@ class FlightControl:
         told = []
         for beacon, heard_at_s in peers:
             age_s = now_s - heard_at_s
-            comparable = beacon.frame_id == self._pac.frame_id and age_s <= _MAX_BEACON_AGE_S
-            if beacon.robot_id in known or not comparable:
+            if (
+                beacon.robot_id in known
+                or beacon.frame_id != self._pac.frame_id
+                or age_s > _MAX_BEACON_AGE_S
+            ):
                 continue
             if beacon.position_m is not None and beacon.velocity_m_s is not None:
                 told.append(
@@ -392,6 +395,8 @@ class FlightControl:
         """Robots that are not listened to any more, where they were: they may still hover there."""
         for neighbour in heard:
             self._last_places[neighbour.robot_id] = neighbour, now_s - neighbour.age_s
+        if not self.revoked:
+            return ()
         silent = self.revoked.intersection(self._last_places) - {n.robot_id for n in heard}
         stay = []
         for robot_id in sorted(silent):
@@ -424,9 +429,9 @@ class FlightControl:
                 self._last_words[beacon.robot_id] = heard_beacon
         others = {self.assignment.robot.robot_id, *(n.robot_id for n in heard), *self.revoked}
         return tuple(
-            told._replace(age_s=now_s - at_s)
-            for robot_id, (beacon, at_s) in sorted(self._last_words.items())
-            if robot_id not in others and (told := last_word(beacon, silence)) is not None
+            told._replace(age_s=now_s - self._last_words[robot_id].heard_at_s)
+            for robot_id in sorted(self._last_words.keys() - others)
+            if (told := last_word(self._last_words[robot_id].beacon, silence)) is not None
         )
 
     def _look_where_to_land(

@@ -14,7 +14,7 @@ from edge.core import F64
 from edge.core.logger import errors_only
 from edge.flight.orders import ORDERS
 from edge.flight.state import Robot
-from edge.flight.transitions import TRANSITIONS, Transition
+from edge.flight.transitions import TRANSITIONS, Transition, by_state
 from edge.identity.guard import SignedGuard
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
@@ -52,7 +52,7 @@ def swapped(first: ReasonCode, second: ReasonCode) -> Mutation:
         rows = list(TRANSITIONS)
         i, j = (rows.index(_row(code)) for code in (first, second))
         rows[i], rows[j] = rows[j], rows[i]
-        monkeypatch.setattr(edge.flight.step, "TRANSITIONS", tuple(rows))
+        monkeypatch.setattr(edge.flight.step, "ROWS", by_state(rows))
 
     return mutate
 

@@ -17,7 +17,7 @@ from edge.drivers.flight_log import read
 from edge.flight import guidance, orders, safety, state, step
 from edge.flight.record import FlightTick, TickError, TickReader, TickWriter
 from edge.flight.replay import FlightReplay, differing
-from edge.flight.transitions import TRANSITIONS, Transition
+from edge.flight.transitions import TRANSITIONS, Rows, by_state
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
 from tests.record_flights import FLIGHTS, RECORDED
@@ -68,7 +68,7 @@ def test_each_row_of_the_table_leads_somewhere_in_a_recorded_flight() -> None:
     assert {(row.code, row.sources[0]) for row in left} == NOT_RECORDED
 
 
-def _swapped(one: ReasonCode, other: ReasonCode, source: FlightState) -> tuple[Transition, ...]:
+def _swapped(one: ReasonCode, other: ReasonCode, source: FlightState) -> Rows:
     """The table with these two rows in each other's places."""
     rows = list(TRANSITIONS)
     i, j = (
@@ -76,30 +76,30 @@ def _swapped(one: ReasonCode, other: ReasonCode, source: FlightState) -> tuple[T
         for code in (one, other)
     )
     rows[i], rows[j] = rows[j], rows[i]
-    return tuple(rows)
+    return by_state(rows)
 
 
-def _without(code: ReasonCode) -> tuple[Transition, ...]:
-    return tuple(row for row in TRANSITIONS if row.code is not code)
+def _without(code: ReasonCode) -> Rows:
+    return by_state([row for row in TRANSITIONS if row.code is not code])
 
 
 MUTATIONS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]]] = {
     "a lapse is taken for a pilot's doing": (
         lambda patch: patch.setattr(
-            step, "TRANSITIONS",
+            step, "ROWS",
             _swapped(ReasonCode.CONTROL_SILENT, ReasonCode.LEFT_OFFBOARD, _S.MISSION),
         ),
         ("program_hangs",),
     ),
     "a critical battery returns": (
         lambda patch: patch.setattr(
-            step, "TRANSITIONS",
+            step, "ROWS",
             _swapped(ReasonCode.BATTERY_CRITICAL, ReasonCode.BATTERY_LOW, _S.MISSION),
         ),
         ("battery_critical",),
     ),
     "no row for a lost ground": (
-        lambda patch: patch.setattr(step, "TRANSITIONS", _without(ReasonCode.GROUND_LOST)),
+        lambda patch: patch.setattr(step, "ROWS", _without(ReasonCode.GROUND_LOST)),
         ("ground_lost",),
     ),
     "no brake before a neighbour": (
@@ -179,7 +179,7 @@ def test_a_difference_is_told_once_with_its_times() -> None:
     messages = list(read(RECORDED / "ground_lost.mcap", "flight"))
     replay = FlightReplay()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(step, "TRANSITIONS", _without(ReasonCode.GROUND_LOST))
+        patch.setattr(step, "ROWS", _without(ReasonCode.GROUND_LOST))
         for _, unix_time_s, message in messages:
             replay.run(unix_time_s, message)
     told = [d for d in replay.differences if d.differing.what == "state"]
