@@ -10,8 +10,7 @@ is late, the vehicle's own time does, of those messages that have it.
 import math
 from collections import OrderedDict, deque
 from collections.abc import Hashable
-from enum import Enum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 _NUMBERS = 256
 _MOST_PATHS = 8
@@ -29,6 +28,9 @@ _BACK_S = 0.03
 # Shares and alarms are those of so many whole seconds, and of so many frames.
 _LOSS_S, _OTHERS_S, _LEAST_FRAMES = 10, 5, 100
 _LEAST_TWICE, _LEAST_OTHERS, _OTHERS_SHARE = 20, 3, 0.25
+
+
+_Sort = Literal["next", "again", "late", "other"]
 
 
 class Frame(NamedTuple):
@@ -50,13 +52,6 @@ class _Newest(NamedTuple):
     vehicle_s: float
     at_s: float
     path: Hashable
-
-
-class _Sort(Enum):
-    NEXT = "next"
-    AGAIN = "again"
-    LATE = "late"
-    OTHER = "other"
 
 
 class _Stream:
@@ -142,7 +137,7 @@ class VehicleFrames:
         sort, stream = self._sort(frame, path, now_s)
         path.heard_at_s = now_s
         second = self._this(now_s)
-        second.again += sort is _Sort.AGAIN
+        second.again += sort == "again"
         if frame.vehicle_s is None:
             is_old = self._is_late(path) or (stream is not None and stream.is_late)
         else:
@@ -151,9 +146,9 @@ class VehicleFrames:
             is_old = back_s > 0.0
             same_time = newest is not None and back_s == 0.0 and newest.path != frame.path
             # One vehicle would not say it so, if it does not say it again.
-            if (back_s > _BACK_S or same_time) and sort in (_Sort.NEXT, _Sort.OTHER):
+            if (back_s > _BACK_S or same_time) and sort in ("next", "other"):
                 second.others += 1
-        if is_old or sort is not _Sort.NEXT:
+        if is_old or sort != "next":
             return False
         second.taken += 1
         self._taken[frame.content] = now_s, frame.path, stream
@@ -223,7 +218,7 @@ class VehicleFrames:
         # Once its numbers have come round, a stream may say the same with the same number.
         came_round = stream is None or (ahead == 1 and taken is not None and taken[2] is stream)
         if taken is not None and not by_other and not came_round:
-            return _Sort.AGAIN, stream
+            return "again", stream
         follows = 0 < ahead <= _MOST_LOST
         was_missing = not follows and any(frame.number in s.missing for s in path.streams)
         comes_next, is_late = not was_missing, False
@@ -242,10 +237,10 @@ class VehicleFrames:
                 stream, ahead = path.begin_stream(frame.number), 1
             self._count_missing(stream, frame, ahead, now_s)
         if comes_next:
-            return _Sort.AGAIN if by_other else _Sort.NEXT, stream
+            return "again" if by_other else "next", stream
         if by_other:
-            return _Sort.AGAIN, stream
-        return _Sort.LATE if was_missing else _Sort.OTHER, stream
+            return "again", stream
+        return "late" if was_missing else "other", stream
 
     def _count_missing(self, stream: _Stream, frame: Frame, ahead: int, now_s: float) -> None:
         stream.newest, stream.heard_at_s = frame.number, now_s
