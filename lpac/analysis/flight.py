@@ -67,7 +67,7 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotRecord:
-    """What a robot said in a flight; a point that is simulated says nothing but its places.
+    """One robot's track and statuses in a flight; a simulated point has no statuses.
 
     `time_s` (T,), `position_m` (T, 3) in the mission frame with heights above its own pad, NaN
     where it did not know, `flying` (T,). `said` (T,) are the statuses, if there are any.
@@ -189,7 +189,7 @@ class LoopLateness:
 
 
 class ScriptCommand(NamedTuple):
-    """What the script commanded, in words; codes of what kept it, and of what each robot did."""
+    """A command of the script, in words, with codes of its problem and of each robot's result."""
 
     command: str
     done: bool
@@ -198,7 +198,7 @@ class ScriptCommand(NamedTuple):
 
 
 class ProgramRecord(NamedTuple):
-    """What one robot's program did in a script's flight, and took.
+    """One robot's program in a script's flight.
 
     `changes` of its state as it said itself, s from the script's start; `last` is its last status
     in the mission, or of all. `cpu_share` is of a core.
@@ -239,7 +239,7 @@ class ScriptRecord:
 
 
 class GivenOrder(NamedTuple):
-    """The operator ordered something of robots, from when it was asked for until it was answered.
+    """An order of the operator to robots, from its request until it was answered.
 
     `ended_s` is inf while it is not.
     """
@@ -252,7 +252,7 @@ class GivenOrder(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FaultRecord:
-    """The fault of a drill's flight, and what its bounds need to know beside the vehicles' truth.
+    """The fault of a drill's flight, and what its bounds need beside the true tracks.
 
     `hit` are the vehicles that it was done to, `begin_s` when it began, `marks` further times by
     their names. `pads_m` (N, 2) is where vehicles really stood at first, `drone_m` their size.
@@ -355,7 +355,7 @@ class FlightRecord:
 
     @cached_property
     def _counted(self) -> tuple[F64, F64]:
-        """When anybody counts for J, (C,); and where these are, (C, N, 2), m, NaN who does not."""
+        """Times (C,) with robots that count for J; their positions (C, N, 2), m, others NaN."""
         if self.coverage is None or not len(self.cost_time_s):
             return np.zeros(0), np.zeros((0, len(self.robots), 2))
         places_m = np.stack(
@@ -469,7 +469,7 @@ class FlightRecord:
         )
 
     def mission_share(self, robot: RobotRecord) -> float:
-        """Which share of the mission's time it flew the mission."""
+        """Share of the mission's time in which it flew the mission."""
         flown_s = sum(
             max(0.0, min(end_s, self.duration_s) - max(begin_s, 0.0))
             for state, begin_s, end_s in robot.intervals(self.to_s)
@@ -478,7 +478,7 @@ class FlightRecord:
         return flown_s / self.duration_s if self.duration_s > 0.0 else 0.0
 
     def places_at(self, time_s: float) -> dict[str, tuple[float, float]]:
-        """Who was in the air where, m, by name."""
+        """Positions of the robots in the air, (x, y), m, by name."""
         found = {}
         for robot in self.robots:
             x_m, y_m, _ = robot.places_at(np.array([time_s]))[0].tolist()
@@ -487,7 +487,7 @@ class FlightRecord:
         return found
 
     def seen(self, time_s: float) -> npt.NDArray[np.bool_]:
-        """Which cells of the world lay in a robot's sensor view in the mission so far, [x, y]."""
+        """Cells of the world that lay in a robot's sensor view in the mission so far, [x, y]."""
         assert self.coverage is not None
         world_size = len(self.coverage.importance)
         seen = np.zeros((world_size, world_size), np.bool_)

@@ -206,7 +206,7 @@ def _flag(name: str) -> str:
 def _scenario(
     run: RunOptions, drawn: FlightOptions, of_scenario: Any, count: int | None
 ) -> "Scenario":
-    """What the options say; of one robot if as many are wanted as the machine carries.
+    """Build the scenario of the options; of one robot where the machine decides how many.
 
     Raises ValueError for what is impossible, or would do nothing.
     """
@@ -257,7 +257,7 @@ def _require_of_baselines(scenario: "Scenario") -> None:
 
 
 def _failures(drawn: FlightOptions, robots: int, duration_s: float) -> tuple["Failure", ...]:
-    """What --lost and --away say. Raises ValueError, also for what would come after the flight."""
+    """Parse --lost and --away. Raises ValueError, also for times after the flight."""
     from lpac.sim.failure import Failure, LostRobots
 
     failures = [Failure.parse(each) for each in drawn.away or ()]

@@ -239,7 +239,7 @@ def _fence_line(margin_m: float, true_margin_m: float, position_error_m: float) 
 
 
 def _outcome(record: FlightRecord) -> str:
-    """What became of the robots, and of their mission."""
+    """Outcome of the mission and of the landing, in words."""
     if not record.took_off:
         return "nobody took off"
     landed = "all landed and disarmed" if record.all_landed else "NOT ALL LANDED"

@@ -29,7 +29,7 @@ SAMPLES_PER_COST = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Preparation:
-    """What a scenario comes to with a bundle: all that a simulator of it begins with.
+    """Initial state of a simulator: a scenario together with a bundle.
 
     `bundle` has the scenario's own sizes in its manifest. `starts_m` (N, 2) and `bias_m` (N, 2) or
     None are in the mission frame, `importance` is (world_size, world_size), `times_s` are those of
@@ -61,7 +61,7 @@ class Preparation:
     def record(
         self, positions_m: F64, message_counts: dict[str, int], largest_payload: float
     ) -> FlightRecord:
-        """What came out, with true positions (T, N, 2) at `times_s`.
+        """Record of the flight with true positions (T, N, 2) at `times_s`.
 
         Points are in the air from the first to the last, unless they failed, and say nothing.
         """
@@ -148,7 +148,7 @@ def require_points(scenario: Scenario) -> None:
 
 
 class FlyingSwarm(Protocol):
-    """What can be told of robots in flight."""
+    """State of the robots in flight."""
 
     def positions_m(self) -> F64: ...
     def velocities_m_s(self) -> F64: ...
@@ -224,7 +224,7 @@ class WorldMoment:
 
 
 class FlightMoment(WorldMoment):
-    """What a flight's watcher is shown."""
+    """A moment of a flight of points, for its watcher."""
 
     step = "mission"
     stopped = False

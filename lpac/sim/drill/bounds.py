@@ -1,4 +1,4 @@
-"""What is promised of a flight, as figures of the vehicles' truth with limits stated beforehand.
+"""Promises of the drill: figures of a flight's record, with limits stated beforehand.
 
 `ALWAYS` counts in every flight, whatever is done to the fleet. Everything here is pure.
 """
@@ -80,7 +80,7 @@ class Criterion(Protocol):
     """One promise."""
 
     def figure(self, flight: FlightRecord) -> Figure:
-        """What came of it in this flight."""
+        """Measure it in this flight."""
         ...
 
 
@@ -237,7 +237,7 @@ class FewCommands:
 
 
 def always(beyond_fence_m: float, carried: Whose) -> tuple[Criterion, ...]:
-    """What counts in every flight; the fault itself may bring who is `carried` so far outside."""
+    """Bounds of every flight; a fault may itself bring the `carried` so far outside."""
     inside: tuple[Criterion, ...] = (InsideFence(),)
     if beyond_fence_m != POSITION_ERROR_M:
         inside = (InsideFence(beyond_fence_m, carried),)

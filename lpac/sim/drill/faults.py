@@ -135,7 +135,7 @@ _AT_PAD_M = 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """What is done to a fleet, when, and what is promised then.
+    """A fault done to a fleet: its injections, their times, and what is promised then.
 
     `what` happens, `promise` in words; both are for people. It begins in the `phase`, at a time
     that the seed draws, and hits so many robots, which the seed draws too (0: the whole fleet, at
@@ -162,7 +162,7 @@ class Fault:
 
     @property
     def judged_by(self) -> tuple[Criterion, ...]:
-        """What counts in every flight, and its own bounds."""
+        """Bounds of every flight, and the fault's own."""
         return (*always(self.beyond_fence_m, self.carried), *self.bounds)
 
 

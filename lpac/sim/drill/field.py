@@ -1,4 +1,4 @@
-"""What all fleets of the drill share: who is meant, what was ordered, and where vehicles are."""
+"""Common part of all fleets of the drill: targets of a fault, orders, true positions."""
 
 import math
 from abc import ABC, abstractmethod
@@ -40,7 +40,7 @@ _ORDER_S = 10.0
 
 
 class FaultyVehicle(Protocol):
-    """Where a vehicle is, and takes itself to be: the world's frame, (3,), m."""
+    """True and estimated position of a vehicle: the world's frame, (3,), m."""
 
     position_m: F64
     rc_connected: bool
@@ -77,7 +77,7 @@ class FaultyFleet(ABC):
     @property
     @abstractmethod
     def robots_by_name(self) -> dict[str, int]:
-        """What the operator calls them."""
+        """Robot ids by the operator's names."""
 
     @abstractmethod
     def height_m(self, robot: int) -> float:
@@ -93,7 +93,7 @@ class FaultyFleet(ABC):
 
     @abstractmethod
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """What the vehicles did, in the world's frame."""
+        """True tracks of the vehicles so far, in the world's frame."""
 
     def highest_m(self) -> float:
         """The height of the robot that flies highest."""
@@ -222,7 +222,7 @@ def supports(injections: tuple[type, ...], fault: Fault) -> bool:
 
 
 def _kind(request: Request) -> str:
-    """What an order is called in a flight's truth."""
+    """Name of an order in a flight's record."""
     if isinstance(request, RobotCommand):
         return request.kind
     return request.action if isinstance(request, SafetyCommand) else type(request).__name__.lower()

@@ -72,7 +72,7 @@ class Field(Protocol):
 
 
 class Timeline(NamedTuple):
-    """Who was hit, and when what happened, s of the vehicles' clock."""
+    """Robots that were hit, and times of the fault and its marks, s of the vehicles' clock."""
 
     hit: tuple[int, ...]
     fault_s: float
@@ -80,7 +80,7 @@ class Timeline(NamedTuple):
 
 
 def drawn(fault: Fault, seed: int, robots: int) -> tuple[tuple[int, ...], float]:
-    """Who is hit, and how long after its phase the fault begins, s."""
+    """Draw the robots to hit, and how long after its phase the fault begins, s."""
     rng = np.random.default_rng([seed, zlib.crc32(fault.name.encode())])
     order = rng.permutation(robots).tolist()
     hits = min(fault.hits, robots) if fault.hits else robots
@@ -127,7 +127,7 @@ def fly(field: Field, fault: Fault, scenario: Scenario) -> Procedure[Timeline]:
 
 
 def _command(field: Field, request: Request) -> Procedure[CommandReport | None]:
-    """What comes of it; None if there is no ground, or it does not end."""
+    """Report of the command; None if there is no ground, or it does not end."""
     if not field.ground_runs:
         return None
     answered = field.noted(request)

@@ -1,4 +1,4 @@
-"""What can be done to a fleet in flight. Each kind of vehicle says which of it it can (`supports`).
+"""Injections: changes done to a fleet in flight. Each kind of vehicle supports some (`supports`).
 
 Those below `VehicleInjection` are done to a simulated vehicle, whoever flies it. Those below
 `PilotInjection` are what somebody with a remote control, or a ground station, does with any.
@@ -188,7 +188,7 @@ class EstimateJumpsOut(VehicleInjection):
 
 @dataclass(frozen=True, slots=True)
 class EstimateIsRight(VehicleInjection):
-    """What led the estimate astray is over, and it jumps back."""
+    """End the estimator's error: its position jumps back."""
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
         vehicle.gps_offset_m = np.zeros(3)
@@ -206,7 +206,7 @@ class OriginJumps(VehicleInjection):
 
 @dataclass(frozen=True, slots=True)
 class CompassJumps(VehicleInjection):
-    """What it takes its heading to be is another at once."""
+    """Make the estimated heading jump."""
 
     by_deg: float
 
@@ -408,7 +408,7 @@ class SecondProgram:
 
 @dataclass(frozen=True, slots=True)
 class RadioIs:
-    """What becomes of all messages; see `lpac.sim.air.Air`."""
+    """Loss and delay of all messages; see `lpac.sim.air.Air`."""
 
     loss: float = 0.0
     duplication: float = 0.0
@@ -421,7 +421,7 @@ Cut = Literal["none", "from the ground", "from each other", "all", "in halves"]
 
 @dataclass(frozen=True, slots=True)
 class RadioCut:
-    """Who hears nothing of whom: robots of the ground, of each other, nobody of anybody.
+    """A cut of the radio: between robots and ground, among robots, or everywhere.
 
     In halves, the ground is with the first half.
     """

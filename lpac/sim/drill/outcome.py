@@ -13,7 +13,7 @@ LATE_S = 0.25
 
 
 class FlightOutcome(NamedTuple):
-    """What came of one flight. `error` is what ended it early, such as a defect; else "".
+    """Judged figures of one flight. `error` says what ended it early, such as a defect; else "".
 
     `late_s` is how far the machine was behind real time, if it was flown in that.
     """

@@ -350,7 +350,7 @@ class MavlinkField(ProcessField):
         injection.apply(self.vehicles[robot], robot, self)
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """What they noted."""
+        """True tracks of the vehicles so far, in the world's frame."""
         with self.stepped:
             truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
         return tuple(map(track_of, truths))

@@ -140,7 +140,7 @@ class SimulatedField(FaultyFleet):
         return self.ground_runs
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """What they noted."""
+        """True tracks of the vehicles so far, in the world's frame."""
         return tuple(track_of(vehicle.truth) for vehicle in self.vehicles)
 
     def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:

@@ -122,7 +122,7 @@ def _moment(fleet: SimulatedFleet, flight: ScriptedFlight) -> FleetMoment:
 
 
 class _Notes:
-    """What each robot said of itself, as its own log would have it."""
+    """Statuses of each robot, as its own log would have them."""
 
     def __init__(self, fleet: SimulatedFleet) -> None:
         self._fleet = fleet

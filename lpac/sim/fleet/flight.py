@@ -135,7 +135,7 @@ def _in_sight(fleet: Fleet) -> Iterator[SimulatedVehicles | RealVehicles]:
 
 
 class _Moment(NamedTuple):
-    """What everybody has used at one time."""
+    """CPU time and memory of all processes at one time."""
 
     time_s: float
     usages: tuple[Usage, ...]
@@ -203,7 +203,7 @@ def _record(
 
 
 class RobotUsage(NamedTuple):
-    """What the program of one robot took, and the logs that it left."""
+    """CPU share and memory of one robot's program, and the logs that it left."""
 
     cpu_share: float = 0.0
     peak_memory_mb: float = 0.0

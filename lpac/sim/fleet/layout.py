@@ -206,7 +206,7 @@ class Layout:
             assign(folder / "fleet.toml", slot, None)
 
     def _pad_seen_m(self, robot: int) -> list[float]:
-        """Where a robot takes its pad to be: mission frame, m."""
+        """A robot's pad by its own estimate: mission frame, m."""
         return [round(c, 3) for c in self.landing_points_m[robot].tolist()]
 
     def _draw_vehicles(self) -> tuple[F64, F64, tuple[Px4Vehicle, ...]]:

@@ -256,7 +256,7 @@ class SimulatedRobots:
         return second
 
     def true_positions_m(self) -> F64:
-        """Where the vehicles really are: the mission frame, (N, 3), m."""
+        """True positions of the vehicles: the mission frame, (N, 3), m."""
         to_mission = self.layout.to_mission
         return np.array(
             [to_mission.local_to_mission(each.vehicle.position_m) for each in self.vehicles]

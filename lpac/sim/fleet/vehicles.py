@@ -51,7 +51,7 @@ class Vehicles(Protocol):
 
 
 def track_of(entries: Sequence[Truth]) -> TrueTrack:
-    """What a simulated vehicle noted, on its own clock and in the world's frame."""
+    """Track of a simulated vehicle, on its own clock and in the world's frame."""
 
     def of(name: str, kind: type[Any], *shape: int) -> npt.NDArray[Any]:
         return np.array([getattr(entry, name) for entry in entries], kind).reshape(-1, *shape)

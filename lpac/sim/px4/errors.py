@@ -184,7 +184,7 @@ class Errors:
         return self._heading_rad if time_s < self._yaw_reset_s else self._heading_after_rad
 
     def wind_m_s(self, time_s: float) -> Vector:
-        """Where the air goes, gusts and all; the same for the whole fleet."""
+        """Wind velocity with gusts, the same for the whole fleet."""
         gust = max(0.0, math.sin(self._gust_rad_s * time_s)) ** 3
         gusts_m_s = max(0.0, GREATEST_WIND_M_S - self._mean_wind_m_s)
         speed_m_s = self._mean_wind_m_s + gusts_m_s * gust

@@ -313,7 +313,7 @@ class Px4Vehicle:
 
     @property
     def estimated_heading_rad(self) -> float:
-        """Where the vehicle takes its nose to point."""
+        """Estimated heading, rad."""
         return self.heading_rad + self._compass_rad
 
     @property

@@ -71,7 +71,7 @@ _MACHINES = {3: "i386", 40: "arm", 62: "x86_64", 183: "aarch64", 243: "riscv64"}
 
 
 class _Place(NamedTuple):
-    """Where a vehicle really was: `time.monotonic()`, and north, east, down, m."""
+    """True position at a `time.monotonic()`: north, east, down, m."""
 
     time_s: float
     position_m: tuple[float, float, float]

@@ -115,7 +115,7 @@ class RealVehicle:
 
     @property
     def estimated_position_m(self) -> F64:
-        """Where PX4 takes itself to be, in the world."""
+        """PX4's estimated position, in the world's frame."""
         return self._local_m + self._origin_m
 
     # What is done to it
