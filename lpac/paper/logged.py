@@ -77,13 +77,6 @@ class LoggedMissions:
             )
         return bundle
 
-    def report(self, name: str, title: str, section: Section, flown: str) -> Report:
-        """What one section tells."""
-        return Report(
-            name=name, title=title, text=flown, told=section.told, rows=section.rows,
-            tables=section.tables, figures=section.figures, flown=flown, made_by=self.made_by,
-        )  # fmt: skip
-
 
 def ids_in(records: Mapping[str, FlightRecord]) -> list[str]:
     """The ids of the bundles that flew."""
@@ -106,7 +99,9 @@ def _e1(of: LoggedMissions) -> Report:
         name: {"flight": record, **beside.get(name, {})} for name, record in of.records.items()
     }
     section = snapshots(by_mission, of.folder)
-    return of.report("e1", "E1, transferability", section, _BESIDE_POINTS if beside else LOGS)
+    return section.report(
+        "e1", "E1, transferability", _BESIDE_POINTS if beside else LOGS, of.made_by
+    )
 
 
 def _baselines_beside(
@@ -156,7 +151,7 @@ def _e2(of: LoggedMissions) -> Report:
     if len(of.records) < 2:
         raise ValueError(f"missions in {of.logs}: {len(of.records)}: must be at least 2")
     section = repeatability(of.records, of.folder, _TRIAL_S)
-    return of.report("e2", "E2, repeatability", section, LOGS)
+    return section.report("e2", "E2, repeatability", LOGS, of.made_by)
 
 
 def _e3(of: LoggedMissions) -> Report:
@@ -171,7 +166,7 @@ def _e3(of: LoggedMissions) -> Report:
     range_m = perception.communication_range / FIELD_SCALE.env_scale
     [record] = of.records.values()
     section = perturbation(perturbed_by(record, absences_of(record), range_m), of.folder)
-    return of.report("e3", "E3, perturbation", section, _TAKEN)
+    return section.report("e3", "E3, perturbation", _TAKEN, of.made_by)
 
 
 def _async(of: LoggedMissions) -> Report:
@@ -187,7 +182,7 @@ def _async(of: LoggedMissions) -> Report:
             of.note(f"{name} is left out: {why}")
     said = message_bytes(bundle, 2)
     section = rates(results_of_logs(of.records), said, of.folder, paired=False)
-    return of.report("async", "Rates and asynchrony", section, _BY_RATES)
+    return section.report("async", "Rates and asynchrony", _BY_RATES, of.made_by)
 
 
 def _transfer(of: LoggedMissions) -> Report:
@@ -218,7 +213,7 @@ def _transfer(of: LoggedMissions) -> Report:
     }
     section = Section(told, tables_of(told), draw_conditions(results, of.folder), rows_of(told))
     title = "Transfer to other teams and worlds"
-    return replace(of.report("transfer", title, section, _BESIDE_POINTS), legend=LEGEND)
+    return replace(section.report("transfer", title, _BESIDE_POINTS, of.made_by), legend=LEGEND)
 
 
 def _by_team(

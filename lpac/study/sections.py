@@ -15,7 +15,7 @@ from lpac.analysis.flight import FlightRecord
 from lpac.study import figures
 from lpac.study.perturbation import PerturbedFlight
 from lpac.study.repeatability import looked_at, looked_at_from_s, spread_of, who_is_missing
-from lpac.study.report import Picture, Table, write_csv
+from lpac.study.report import Picture, Report, Table, write_csv
 
 _COSTS = (
     "Costs are divided by that at the start: for points, of their true positions; for whole robots "
@@ -35,6 +35,13 @@ class Section:
     tables: Sequence[Table]
     figures: Sequence[Picture]
     rows: Sequence[Sequence[object]]
+
+    def report(self, name: str, title: str, flown: str, made_by: Mapping[str, str]) -> Report:
+        """A report of this alone; `flown` and `made_by` are `Report`'s."""
+        return Report(
+            name=name, title=title, text=flown, told=self.told, rows=self.rows,
+            tables=self.tables, figures=self.figures, flown=flown, made_by=made_by,
+        )  # fmt: skip
 
 
 def snapshots(records: Mapping[str, Mapping[str, FlightRecord]], folder: Path) -> Section:

@@ -103,18 +103,26 @@ def test_a_logged_flight_is_held_against_baselines_from_where_it_began(
     assert "points from where the robots were" in told["flown"]
 
 
+def of_another_policy(mission: FlightRecord) -> FlightRecord:
+    robots = tuple(
+        replace(r, said=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
+        for r in mission.robots
+    )
+    return replace(mission, name="paper-0", robots=robots)
+
+
+def read_from_logs(monkeypatch: pytest.MonkeyPatch, *missions: FlightRecord) -> None:
+    examined = Examined(missions, ())
+    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
+
+
 def test_a_logged_flight_of_another_policy_has_no_baselines(
     mission: FlightRecord,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    robots = tuple(
-        replace(r, said=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
-        for r in mission.robots
-    )
-    examined = Examined((replace(mission, robots=robots),), ())
-    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
+    read_from_logs(monkeypatch, of_another_policy(mission))
     e1(logs=tmp_path, out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
     assert [list(of_world) for of_world in told["flights"].values()] == [["flight"]]
@@ -128,13 +136,7 @@ def test_of_a_day_with_two_policies_each_mission_is_looked_at_by_itself(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    robots = tuple(
-        replace(r, said=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
-        for r in mission.robots
-    )
-    other = replace(mission, name="paper-0", robots=robots)
-    examined = Examined((other, mission), ())
-    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
+    read_from_logs(monkeypatch, of_another_policy(mission), mission)
     e1(logs=tmp_path, out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
     assert [len(of_world) for of_world in told["flights"].values()] == [1, 1 + len(BASELINES)]
@@ -171,8 +173,8 @@ def test_missions_are_put_together_by_their_rates(
     robots = tuple(replace(robot, time_s=robot.time_s * 12.0) for robot in mission.robots)
     record = replace(mission, duration_s=60.0, to_s=60.0, cost_time_s=minute_s, robots=robots)
     rates = {"paper-1": LoopRates(5.0, 2.5), "paper-2": LoopRates(5.0, 1.0), "paper-3": None}
-    trials = tuple(replace(record, name=name, rates=its) for name, its in rates.items())
-    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: Examined(trials, ()))
+    missions = [replace(record, name=name, rates=its) for name, its in rates.items()]
+    read_from_logs(monkeypatch, *missions)
     asynchrony(logs=Path("day 1"), out=tmp_path)
     assert "paper-3 is left out: its robots' rates differ" in capsys.readouterr().err
     told = json.loads((tmp_path / "async.json").read_text())
@@ -205,12 +207,7 @@ def test_missions_are_put_together_by_their_teams(mission: FlightRecord, tmp_pat
 def test_neighbours_are_those_in_range_of_the_policy_that_flew(
     mission: FlightRecord, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    robots = tuple(
-        replace(r, said=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
-        for r in mission.robots
-    )
-    examined = Examined((replace(mission, robots=robots),), ())
-    monkeypatch.setattr(lpac.analysis.examination, "examine", lambda *_: examined)
+    read_from_logs(monkeypatch, of_another_policy(mission))
     with pytest.raises(ValueError, match="is not what flew, 0123456789abcdef: give that with --b"):
         e3(logs=tmp_path, out=tmp_path)
 

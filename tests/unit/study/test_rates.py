@@ -17,7 +17,6 @@ from lpac.sim.scenario import Scenario
 from lpac.sim.ticks import Clocks
 from lpac.study.flights import CLAIRVOYANT, CostCurve, curves_of
 from lpac.study.rates import FIELD, Timing, TimingResult, rates, results_of, results_of_logs
-from lpac.study.report import Report
 from lpac.study.results import results_of as results_of_study
 from lpac.study.study import Condition, Draw, Method, Study
 from lpac.study.worlds import FIELD as FIELD_SET_UP
@@ -60,11 +59,8 @@ def flown() -> list[TimingResult]:
 def reported(results: list[TimingResult], folder: Path, *, paired: bool = True) -> str:
     """README.md."""
     section = rates(results, 2000, folder, paired=paired)
-    Report(
-        name="async", title="Rates", text="Text.", told=section.told, rows=section.rows,
-        tables=section.tables, figures=section.figures, flown="Flown.",
-        made_by={"command": "lpac paper async --quick"},
-    ).write(folder)  # fmt: skip
+    made_by = {"command": "lpac paper async --quick"}
+    section.report("async", "Rates", "Flown.", made_by).write(folder)
     return (folder / "README.md").read_text()
 
 

@@ -19,7 +19,6 @@ from lpac.sim.failure import Failure
 from lpac.sim.scenario import Scenario
 from lpac.study.perturbation import absences_in, absences_of, perturbed_by
 from lpac.study.repeatability import spread_of, who_is_missing
-from lpac.study.report import Report
 from lpac.study.sections import Section, perturbation, repeatability, snapshots
 
 MADE_BY = {"command": "lpac paper ..."}
@@ -39,10 +38,7 @@ def flown(
 
 def written(name: str, section: Section, folder: Path) -> str:
     """Its README.md."""
-    Report(
-        name=name, title=name, text="Text.", told=section.told, rows=section.rows,
-        tables=section.tables, figures=section.figures, flown="Flown.", made_by=MADE_BY,
-    ).write(folder)  # fmt: skip
+    section.report(name, name, "Flown.", MADE_BY).write(folder)
     return (folder / "README.md").read_text()
 
 
