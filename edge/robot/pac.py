@@ -145,6 +145,13 @@ class Pac:
         self._odometry = odometry
         self._parameters = parameters
         self._perception = manifest.perception
+        self._decode = functools.partial(
+            _decode,
+            bundle_id=policy.bundle_id,
+            message_size=policy.message_size,
+            payload_limit=manifest.payload_limit,
+            shared_side=manifest.perception.shared_map_side,
+        )
         self._memory = RobotMemory(manifest.perception)
         self._agent = policy.agent()
         # Set by whoever wants it, done by the thread that the memory, or the agent, belongs to.
@@ -185,15 +192,7 @@ class Pac:
         It is what is in `data` from `start` on. `sender` is the robot that it came from, for
         whoever knows: no other's is taken then.
         """
-        message = _decode(
-            data,
-            start,
-            bundle_id=self._policy.bundle_id,
-            frame_id=self.frame_id,
-            message_size=self._policy.message_size,
-            payload_limit=self._policy.manifest.payload_limit,
-            shared_side=self._perception.shared_map_side,
-        )
+        message = self._decode(data, start, frame_id=self.frame_id)
         if not isinstance(message, Rejection) and sender not in (None, message.robot_id):
             message = Rejection.OTHER_SENDER
         if isinstance(message, Rejection):
