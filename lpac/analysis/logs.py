@@ -20,10 +20,10 @@ import msgspec
 import numpy as np
 
 from edge.core import F64
+from edge.core.changes import plain
 from edge.core.fence import Fence
 from edge.core.schema import explain
 from edge.drivers.flight_log import FlightLogError, FlightMetadata, Missing, read, read_metadata
-from edge.messages.codec import encode
 from edge.messages.codes import Reason, Refusal
 from edge.messages.mission import FlightState, LoopStatus, Origin, RobotStatus
 from lpac.analysis.field_truth import (
@@ -201,7 +201,7 @@ class _LogReader:
 
     def take_status(self, status: RobotStatus) -> None:
         """Take what a robot said, as its log would have it."""
-        self._take_status((status.robot_id, status.boot_nonce), json.loads(encode(status)))
+        self._take_status((status.robot_id, status.boot_nonce), plain(status))
 
     def read(self, path: Path) -> None:
         """Take what is understood of a file; a note tells of the rest."""
