@@ -5,7 +5,7 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -113,16 +113,12 @@ def fly_together(tasks: Sequence[StudyTask], folder: Path, ray: str | None) -> "
 def _written(task: StudyTask, flown: "Flown") -> "Report":
     """The report, in its folder."""
     from lpac.study.provenance import made_by_study
-    from lpac.study.summary import report_of, sections_of
+    from lpac.study.summary import report_of
 
     study, folder = task.study, task.folder
-    sections = sections_of(study, flown, folder)
     made_by = made_by_study(task.command or shlex.join(sys.argv[1:]), study)
-    report = report_of(
-        task.name, study, flown.results, sections, folder, made_by, compared=task.compared
-    )
-    told = {**report.told, "test_set_opened": _opened(study), **task.further}
-    report = replace(report, told=told)
+    further = {"test_set_opened": _opened(study), **task.further}
+    report = report_of(task.name, study, flown, folder, made_by, further, compared=task.compared)
     report.write(folder)
     return report
 

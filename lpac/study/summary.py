@@ -159,15 +159,19 @@ def _verdict(verdict: Mapping[str, Any], a: str, b: str, worlds: int) -> Iterato
 def report_of(
     name: str,
     study: Study,
-    results: Mapping[Condition, Sequence[MethodResult]],
-    sections: Sequence[Section],
+    flown: Flown,
     folder: Path,
     made_by: Mapping[str, str],
+    further: Mapping[str, Any],
     *,
     compared: bool = False,
 ) -> Report:
-    """The report of a study, with sections on its flights; draws its figures. Raises OSError."""
-    told = as_json(study, results, compared=compared)
+    """The report of a study, whose JSON has what is `further` to be told; draws its figures.
+
+    Raises OSError; ValueError if flights do not show what a figure is of.
+    """
+    sections = _sections_of(study, flown, folder)
+    told = as_json(study, flown.results, compared=compared)
     for section in sections:
         told |= section.told
     # That of the rates has all conditions in it.
@@ -177,17 +181,17 @@ def report_of(
         title=study.title or name,
         text=f"{study.text} {flown_as(study)}".strip(),
         legend=LEGEND if of_conditions else "",
-        told=told,
+        told={**told, **further},
         rows=next((section.rows for section in sections), rows_of(told)),
         tables=[*(table for its in sections for table in its.tables), *of_conditions],
         figures=[picture for its in sections for picture in its.figures]
-        + draw_conditions(results, folder, study.figures),
+        + draw_conditions(flown.results, folder, study.figures),
         flown=flown_as(study),
         made_by=made_by,
     )
 
 
-def sections_of(study: Study, flown: Flown, folder: Path) -> list[Section]:
+def _sections_of(study: Study, flown: Flown, folder: Path) -> list[Section]:
     """What the study's figures of whole flights and of rates show. Raises OSError, ValueError."""
     condition, policy = study.conditions[0], study.all_methods[0]
     first = {
