@@ -176,14 +176,15 @@ def _task(
         name, bundles, engine=vehicle.value, px4_build=options.px4, quick=quick,
         set_ups=changes.pop("set_ups", ()),
     )  # fmt: skip
-    made = [] if vehicle is VehicleKind.POINT else [f"--vehicle {vehicle.value}"]
-    made += [f"{_OPTIONS[key]} {value}" for key, value in changes.items()]
-    made += [f"--set-up {its}" for its in given.get("set_ups", ())]
-    made += [f"--bundle {path}" for path in bundles if path != DEFAULT_BUNDLE]
-    made += ["--quick"] if quick else []
+    words = ["paper", name]
+    words += [] if vehicle is VehicleKind.POINT else ["--vehicle", vehicle.value]
+    words += [word for key, value in changes.items() for word in (_OPTIONS[key], str(value))]
+    words += [word for its in given.get("set_ups", ()) for word in ("--set-up", its)]
+    words += [word for its in bundles if its != DEFAULT_BUNDLE for word in ("--bundle", str(its))]
+    words += ["--quick"] if quick else []
     return StudyTask(
         name=name, study=replace(study, **changes), folder=options.out or _OUT / name,
-        command=" ".join(["paper", name, *made]),
+        command=shlex.join(words),
     )  # fmt: skip
 
 

@@ -221,7 +221,10 @@ def _sections_of(study: Study, flown: Flown, folder: Path) -> list[Section]:
 
 def _name(study: Study, draw: Draw) -> str:
     """Of one flight among those of a policy under a condition."""
-    return f"world {draw.world}" if study.trials == 1 else f"trial {draw.trial + 1}"
+    world, trial = f"world {draw.world}", f"trial {draw.trial + 1}"
+    if study.trials == 1:
+        return world
+    return trial if study.worlds == 1 else f"{world}, {trial}"
 
 
 def _by_world(

@@ -14,6 +14,7 @@ from lpac.sim.cores import Outcome, Task, in_this_process
 from lpac.study.flights import PlannedFlight
 from lpac.study.run import run, run_together
 from lpac.study.study import Condition, Method, Study
+from lpac.study.summary import report_of
 from lpac.study.worlds import SET_UPS
 from tests.conftest import SHIPPED
 
@@ -73,6 +74,14 @@ def test_what_studies_share_is_flown_once_and_those_that_need_records_have_them(
     groups.clear()
     assert of_each.keys() == dict(run_together(studies, pool, tmp_path, lambda *_: None)).keys()
     assert flown() == {*part.flights()}
+
+
+@pytest.mark.usefixtures("sketched")
+def test_each_trial_in_each_world_is_told(tmp_path: Path) -> None:
+    study = replace(STUDY, trials=2, figures=("snapshots",))
+    [(name, flown)] = run_together({"it": study}, in_this_process, tmp_path, lambda *_: None)
+    told = report_of(name, study, flown, tmp_path, {}, {}).told
+    assert [*told["flights"]] == [f"world {w}, trial {t}" for w in (0, 1) for t in (1, 2)]
 
 
 def test_a_method_needs_its_bundles() -> None:
