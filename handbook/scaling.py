@@ -27,32 +27,21 @@ FLEETS = (10, 30, 100, 300, 1000)
 PAYLOADS: tuple[PayloadType, ...] = ("float16", "int8")
 # The example's field: ten robots in 32 x 32 m, whose messages are of use within 16 m.
 PER_M2, RANGE_M = 10 / 32**2, 16.0
-NEIGHBOURS = PER_M2 * math.pi * RANGE_M**2
 MOST = 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """How a fleet's messages travel; `neighbours` as in `Traffic`."""
+    """How a fleet's messages travel."""
 
     name: str
     transport: Transport
     wifi: Wifi
-    neighbours: float | None = None
-
-    def traffic(self, robots: int, payload: PayloadType) -> Traffic:
-        """Traffic of such a fleet."""
-        return Traffic(
-            robots=robots, message_bytes=MESSAGE_BYTES[payload], neighbours=self.neighbours
-        )
 
 
 _WIRED = Wifi()
 TOPOLOGIES = (
     Topology("mesh", "mesh", _WIRED),
-    Topology("router on a laptop in the Wi-Fi", "router", Wifi(ground_wired=False)),
-    Topology("router on a wire", "router", _WIRED),
-    Topology("router on a wire, by place, at best", "router", _WIRED, NEIGHBOURS),
     Topology("multicast at 6 Mbit/s", "multicast", _WIRED),
     Topology("multicast at 24 Mbit/s", "multicast", Wifi(multicast_rate_mbit_s=24.0)),
 )
@@ -62,18 +51,20 @@ def tables() -> dict[str, str]:
     """The tables of docs/scaling.md, as Markdown, by what they are about."""
     robots = [str(n) for n in FLEETS]
     return {
-        "airtime": _table(("% of the channel's time", *robots), _of_fleets(_percent_of)),
+        "airtime": _table(
+            ("% of the channel's time", *robots, f"robots at {100.0 * MOST:.0f} %"),
+            [
+                (*row, _both(partial(_carried, topology)))
+                for row, topology in zip(_of_fleets(_percent_of), TOPOLOGIES, strict=True)
+            ],
+        ),
         "quality": _table(("lost, mean delay", *robots), _of_fleets(_quality_of)),
         "cells": _table(
-            ("", "robots in one cell", *(f"cells for {n}" for n in robots[1:])),
+            ("", *(f"cells for {n}" for n in robots[2:])),
             [
-                (
-                    topology.name,
-                    _both(partial(_carried, topology)),
-                    *(_both(partial(_cells_of, topology, n)) for n in FLEETS[1:]),
-                )
+                (topology.name, *(_both(partial(_cells_of, topology, n)) for n in FLEETS[2:]))
                 for topology in TOPOLOGIES
-                if topology.transport != "mesh" and topology.wifi.ground_wired
+                if topology.transport != "mesh"
             ],
         ),
     }
@@ -84,10 +75,10 @@ def draw(path: Path) -> None:
     with style.figure(style.WIDTH_IN, 3.0) as figure:
         left, right = figure.subplots(1, 2)
         robots = sorted({round(10 ** (step / 20)) for step in range(6, 61)})
-        for topology, (colour, dashes) in zip(TOPOLOGIES, style.CURVES, strict=True):
+        for topology, (colour, dashes) in zip(TOPOLOGIES, style.CURVES, strict=False):
             of_all = [_total(topology, n, "int8") for n in robots]
             left.plot(robots, of_all, color=colour, ls=dashes, lw=1.3, label=topology.name)
-            if topology.transport != "mesh" and topology.wifi.ground_wired:
+            if topology.transport != "mesh":
                 parted = [_cells(topology, n, "int8") or math.nan for n in robots]
                 right.plot(robots, parted, color=colour, ls=dashes, lw=1.3, drawstyle="steps-mid")
         left.axhline(MOST, color=style.GREY, lw=0.8, ls=style.DOTTED)
@@ -123,8 +114,12 @@ def _both(text: Callable[[PayloadType], str]) -> str:
     return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
 
 
+def _traffic(robots: int, payload: PayloadType) -> Traffic:
+    return Traffic(robots=robots, message_bytes=MESSAGE_BYTES[payload])
+
+
 def _total(topology: Topology, robots: int, payload: PayloadType) -> float:
-    traffic = topology.traffic(robots, payload)
+    traffic = _traffic(robots, payload)
     return airtime(topology.transport, topology.wifi, traffic).total
 
 
@@ -134,7 +129,7 @@ def _percent_of(topology: Topology, robots: int, payload: PayloadType) -> str:
 
 
 def _quality_of(topology: Topology, robots: int, payload: PayloadType) -> str:
-    traffic = topology.traffic(robots, payload)
+    traffic = _traffic(robots, payload)
     quality = link_quality(topology.transport, topology.wifi, traffic)
     if quality.loss > 0.95:
         return "> 95 %"
@@ -142,7 +137,7 @@ def _quality_of(topology: Topology, robots: int, payload: PayloadType) -> str:
 
 
 def _carried(topology: Topology, payload: PayloadType) -> str:
-    traffic = topology.traffic(1, payload)
+    traffic = _traffic(1, payload)
     return str(carries(topology.transport, topology.wifi, traffic, most=MOST))
 
 
@@ -150,7 +145,7 @@ def _cells(topology: Topology, robots: int, payload: PayloadType) -> int | None:
     return cells(
         topology.transport,
         topology.wifi,
-        topology.traffic(robots, payload),
+        _traffic(robots, payload),
         per_m2=PER_M2,
         range_m=RANGE_M,
         most=MOST,

@@ -21,7 +21,7 @@ from lpac.cli.options import (
     require_here,
 )
 from lpac.cli.study import StudyTask, fly_study
-from lpac.cli.transport import WifiFile, calibration, transport_named, wifi_lines
+from lpac.cli.transport import Transport, WifiFile, calibration, wifi_lines
 
 if TYPE_CHECKING:
     from lpac.radio.calibration import Calibration
@@ -89,13 +89,13 @@ class ConditionOptions:
         typer.Option("--loss", help="Also with messages lost with this probability."),
     ] = None
     transports: Annotated[
-        list[str] | None,
+        list[Transport] | None,
         typer.Option(
-            "--transport", metavar="NAME",
+            "--transport",
             help="Also with the radio that such a team would have, by a model of one Wi-Fi "
-            "channel: mesh, router or multicast.",
+            "channel.",
         ),
-    ] = None  # fmt: skip
+    ] = None
     wifi: WifiFile = None
     lost: Annotated[
         list[str] | None,
@@ -215,8 +215,8 @@ def _changes(hard: ConditionOptions, calibrated: "Calibration") -> list[dict[str
     lossy: list[dict[str, Any]] = [
         *({"loss": loss} for loss in hard.losses or ()),
         *(
-            {"radio": {"transport": transport_named(name), "wifi": wifi}}
-            for name in dict.fromkeys(hard.transports or ())
+            {"radio": {"transport": transport, "wifi": wifi}}
+            for transport in dict.fromkeys(hard.transports or ())
         ),
     ]
     payloads = [name for name in PAYLOAD_TYPES if name in (hard.payloads or ())]

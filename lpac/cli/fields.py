@@ -6,7 +6,7 @@ from copy import copy
 from dataclasses import MISSING, Field, fields, make_dataclass
 from enum import StrEnum
 from functools import wraps
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import typer
 from typer.models import ArgumentInfo, OptionInfo
@@ -40,7 +40,8 @@ def options_of(*classes: type[Any]) -> Callable[[Callable[..., None]], Callable[
             for name, value in given.items():
                 require(hints[name], value, flags[name])
                 if _choices(hints[name]) and value is not None:
-                    given[name] = str(value)
+                    several = isinstance(value, list)
+                    given[name] = list(map(str, value)) if several else str(value)
             command(*(cls(**_own(cls, given)) for cls in classes), **further)
 
         options = [*parameters, *own]
@@ -110,18 +111,13 @@ def _choices(hint: Any) -> tuple[str, ...]:
 
 def _plain(hint: Any, name: str) -> Any:
     """The type as typer knows it."""
-    choices = _choices(hint)
-    if choices:
-        kind: Any = StrEnum(name, {choice: choice for choice in choices})  # type: ignore[misc]
-        return kind | None if type(None) in get_args(_without_bounds(hint)) else kind
-    return _without_bounds(hint)
-
-
-def _without_bounds(hint: Any) -> Any:
     if get_origin(hint) is Annotated:
-        return _without_bounds(hint.__origin__)
+        return _plain(hint.__origin__, name)
     arguments = get_args(hint)
     if type(None) in arguments:
-        [kind] = [_without_bounds(each) for each in arguments if each is not type(None)]
-        return kind | None
-    return hint
+        others = tuple(each for each in arguments if each is not type(None))
+        return _plain(Union[others], name) | None  # noqa: UP007
+    if get_origin(hint) is list:
+        return list[_plain(arguments[0], name)]  # type: ignore[misc]
+    choices = _choices(hint)
+    return StrEnum(name, {each: each for each in choices}) if choices else hint

@@ -27,7 +27,7 @@ from lpac.cli.options import (
 )
 from lpac.cli.printing import lines_of, progress_of
 from lpac.cli.programs import as_many_as_carried, say_if_carried, serve
-from lpac.cli.transport import WifiFile, calibration, wifi_lines
+from lpac.cli.transport import Transport, WifiFile, calibration, wifi_lines
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -41,14 +41,6 @@ app = new_app()
 
 DEFAULT_OUT = Path("out/sim")
 _Hz = Annotated[float, Meta(ge=0.1, le=100.0)]
-
-
-class RadioTransport(StrEnum):
-    """How messages travel."""
-
-    MESH = "mesh"
-    ROUTER = "router"
-    MULTICAST = "multicast"
 
 
 class Scale(StrEnum):
@@ -134,10 +126,10 @@ class FlightOptions:
         ),
     ] = None
     transport: Annotated[
-        RadioTransport | None,
+        Transport | None,
         "point: the radio that such a team would have, by a model of one Wi-Fi channel; mavlink, "
-        "px4: whether robots send their messages to each other (mesh, the default), through a "
-        "router, or to all at once.",
+        "px4: whether robots send their messages to each other (mesh, the default), or to all at "
+        "once.",
     ] = None
     wifi: WifiFile = None
 
@@ -225,7 +217,7 @@ def _scenario(
     scale = FIELD_SCALE if drawn.scale is Scale.FIELD else ModelScale(1.0, 1.0)
     radio, found = None, calibration(drawn.wifi, transport=is_point and drawn.transport is not None)
     if is_point and drawn.transport is not None:
-        radio = ModelledRadio(drawn.transport.value, found.wifi)
+        radio = ModelledRadio(drawn.transport, found.wifi)
     scenario = Scenario(
         robots=robots,
         features=features,
@@ -233,7 +225,7 @@ def _scenario(
         radio=radio,
         failures=_failures(drawn, robots, of_scenario.duration_s),
         clocks=_clocks(drawn),
-        transport=drawn.transport.value if drawn.transport and not is_point else "mesh",
+        transport=drawn.transport if drawn.transport and not is_point else "mesh",
         **{name: getattr(of_scenario, name) for name in of_scenario.__dataclass_fields__},
     )
     if scenario.controller != "lpac":

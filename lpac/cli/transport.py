@@ -1,13 +1,25 @@
 """The radio that simulated points fly with: `--transport`, `--wifi`, and what the model says."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+
+def _airtime() -> Any:
+    from lpac.radio import airtime
+
+    return airtime
+
+
 if TYPE_CHECKING:
-    from lpac.radio.airtime import Transport
+    from lpac.radio import airtime
     from lpac.radio.calibration import Calibration, Source
+else:
+    # Only commands that have these options load this file.
+    airtime = _airtime()
+
+Transport = airtime.Transport
 
 WifiFile = Annotated[
     Path | None,
@@ -19,16 +31,6 @@ WifiFile = Annotated[
         "file of records of a field's radio (`lpac fleet radio --record`).",
     ),
 ]
-
-
-def transport_named(text: str) -> "Transport":
-    """Raises ValueError."""
-    from lpac.radio.airtime import TRANSPORTS
-
-    for transport in TRANSPORTS:
-        if transport == text:
-            return transport
-    raise ValueError(f"--transport {text}: must be one of {', '.join(TRANSPORTS)}")
 
 
 def calibration(wifi: Path | None, *, transport: bool) -> "Calibration":

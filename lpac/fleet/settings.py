@@ -30,10 +30,9 @@ from edge.robot.config import (
     require_group,
     require_url,
 )
+from lpac.radio.airtime import Transport
 
 DEFAULT_DIRECTORY = "/opt/lpac"
-
-Transport = Literal["mesh", "router", "multicast"]
 
 # Where fleets' keys are if the file does not say: not beside it, where repositories are.
 _KEYS = "~/.local/share/lpac/keys"
@@ -93,13 +92,12 @@ class SshConfig(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class RadioConfig(Bounded):
-    """How what robots say gets to the others.
+    """How robots' messages get to the others.
 
-    "mesh": each is connected to each, and says it to them one by one. "router": all are connected
-    to a router, at `router` (IPv4 address and port), which `lpac fleet router` is. "multicast":
-    robots tell each other all at once, in `group` (multicast address and port), and the ground by
-    way of the router. `type` and `options` are robot.toml's `link.type` and `link.options`: a radio
-    of your own, which is told all of this too.
+    "mesh": each robot is connected to each, and sends to them one by one. "multicast": robots send
+    to all at once, in `group` (multicast address and port), and to the ground by way of `lpac fleet
+    router`, at `router` (IPv4 address and port). `type` and `options` are robot.toml's `link.type`
+    and `link.options`: a radio of your own, which is told all of this too.
     """
 
     transport: Transport = "mesh"
@@ -121,10 +119,8 @@ class RadioConfig(Bounded):
             must = "must be left out" if self.router else where
             raise ValueError(f"transport = {self.transport!r}: router = {self.router!r}: {must}")
         require_group("group", self.group)
-        if self.transport != "multicast" and self.group != _GROUP:
-            raise ValueError(
-                f"transport = {self.transport!r}: group = {self.group!r}: must be left out"
-            )
+        if self.transport == "mesh" and self.group != _GROUP:
+            raise ValueError(f"transport = 'mesh': group = {self.group!r}: must be left out")
         if self.options and self.type == "zenoh":
             raise ValueError(f"options = {self.options}: type = 'zenoh' takes none")
 
@@ -535,9 +531,12 @@ def _robot_mapping(
         ],
     }
     if config.router is not None:
-        link = {"mode": "client", "connect": [config.router]}
-    if config.radio.transport == "multicast":
-        link |= {"group": config.radio.group, "interface": robot.address}
+        link = {
+            "mode": "client",
+            "connect": [config.router],
+            "group": config.radio.group,
+            "interface": robot.address,
+        }
     if config.radio.type != "zenoh":
         link |= {"type": config.radio.type, "options": config.radio.options}
     own = {

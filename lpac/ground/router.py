@@ -1,4 +1,4 @@
-"""The router of a fleet whose robots are its clients: a process that outlives `lpac ground`."""
+"""The router by which a fleet in multicast reaches its ground: it outlives `lpac ground`."""
 
 import time
 from collections.abc import Callable
@@ -20,8 +20,8 @@ def serve_router(path: Path, stop: Stop, on_listening: Callable[[str], None]) ->
     config = load_fleet(path)
     if config.router is None:
         raise ConfigError(
-            f"{path}: radio: transport = 'mesh' has no router: set transport = \"router\" or "
-            '"multicast" and router = "ADDRESS:PORT", and deploy'
+            f"{path}: radio: transport = 'mesh' has no router: set transport = \"multicast\" and "
+            'router = "ADDRESS:PORT", and deploy'
         )
     identity = load_own_identity(config, None)
     tls = None if identity is None else identity.tls

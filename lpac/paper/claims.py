@@ -13,7 +13,7 @@ import numpy as np
 
 from edge.core.counted import counted
 from lpac.analysis.statistics import Interval95
-from lpac.radio.airtime import Traffic, Transport, Wifi, carries
+from lpac.radio.airtime import TRANSPORTS, Traffic, Wifi, carries
 from lpac.study.rates import FIELD as FIELD_TIMING
 from lpac.study.rates import Timing
 from lpac.study.summary import WHOLE_ROBOTS
@@ -353,10 +353,9 @@ def _network(network: Json) -> list[Claim]:
 
 def _team() -> Claim:
     wifi = Wifi()
-    transports: tuple[Transport, ...] = ("mesh", "router", "multicast")
     said = ", ".join(
         f"{transport} {carries(transport, wifi, Traffic(robots=1), most_robots=1000)} robots"
-        for transport in transports
+        for transport in TRANSPORTS
     )
     return Claim(
         "Size of a team",

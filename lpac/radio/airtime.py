@@ -5,8 +5,6 @@ stations hear each other, on one channel, and around one access point:
 
 - `mesh`: each robot has a TLS connection to each other station. A message crosses the air twice for
   each receiver, station -> access point -> station, and so does TCP's acknowledgement.
-- `router`: a message goes up to a zenoh router once, and down once for each receiver. A router that
-  is itself a station (`Wifi.ground_wired` false) passes all of it on over the air again.
 - `multicast`: what robots tell each other goes up once, acknowledged and at the data rate as all
   that a station sends, and down once for all, at the multicast rate and without acknowledgement.
   What the ground hears or says goes by way of a router, to each robot by itself.
@@ -33,7 +31,8 @@ from edge.core.wire import PayloadType
 from edge.identity.group import DATAGRAM_BYTES, PART_BYTES
 from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATUS, state_hz
 
-Transport = Literal["mesh", "router", "multicast"]
+# How robots' messages travel, in fleets as in the model.
+Transport = Literal["mesh", "multicast"]
 TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
 
 # The OFDM PHY at 5 GHz (IEEE 802.11-2020, 17.4.4), us.
@@ -111,10 +110,9 @@ class Traffic(Bounded):
     """Traffic of a fleet in flight; sizes are those of sealed messages, before any framing.
 
     `message_bytes` and `message_hz` are of what a robot tells its neighbours, `status_hz` of what
-    it tells the ground. `neighbours` is how many robots' messages and cards a robot is sent on
-    average, by who sends on to those in range alone; None: all others'. `guests` are robots of
-    other cells whose messages and cards come by wire and are sent to this cell's robots too.
-    Orders, worlds and revocations are left out: they are sent at moments.
+    it tells the ground. `guests` are robots of other cells whose messages and cards come by wire
+    and are sent to this cell's robots too. Orders, worlds and revocations are left out: they are
+    sent at moments.
 
     Raises ValueError that names an impossible value.
     """
@@ -123,7 +121,6 @@ class Traffic(Bounded):
     message_bytes: Positive = MESSAGE_BYTES["float16"]
     message_hz: NonNegative = MESSAGE.rate_hz
     status_hz: NonNegative = STATUS.rate_hz
-    neighbours: NonNegative | None = None
     guests: AtLeastZero = 0
 
 
@@ -245,7 +242,7 @@ def link_quality(transport: Transport, wifi: Wifi, traffic: Traffic) -> LinkQual
     takes less time: so a channel that `airtime` finds full may still carry all, late. If it does
     not, messages wait `Wifi.queue_s`, and of what is too much for the channel each has the same
     chance to be dropped. In multicast nothing is sent together, and each of a message's frames is
-    lost for good by noise or by a collision; elsewhere it is repeated, and takes time only.
+    lost for good by noise or by a collision; in a mesh it is repeated, and takes time only.
 
     Raises what `airtime` does.
     """
@@ -277,8 +274,8 @@ def _queue(transport: Transport, wifi: Wifi, traffic: Traffic) -> tuple[float, A
             return 0.0, load
         return min(load.message_s * _waiting(load.total), wifi.queue_s), load
     # How often a message for one station comes to its queue.
-    messages = [f for f in _flows(traffic, robots) if f.topic in _MESSAGES]
-    comes_hz = math.fsum(f.senders * f.rate_hz * f.robots for f in messages) / robots
+    message = _flows(traffic, robots)[0]
+    comes_hz = message.senders * message.rate_hz * message.robots / robots
 
     def load_after(wait_s: float) -> Airtime:
         return _airtime(transport, wifi, traffic, robots, 1.0 + comes_hz * wait_s)
@@ -455,27 +452,19 @@ class _Flow(NamedTuple):
     to_ground: bool = False
 
 
-# Of robots to robots.
-_MESSAGES = ("message", "guests' message")
-
-
 def _flows(traffic: Traffic, robots: int) -> tuple[_Flow, ...]:
     others, guests = robots - 1.0, float(traffic.guests)
-    # Of those whose words a robot could hear, the share whose words it is sent.
-    share = 1.0
-    if traffic.neighbours is not None and others + guests > 0.0:
-        share = min(1.0, traffic.neighbours / (others + guests))
-    heard = share * (others + guests)
+    heard = others + guests
     size, hz = traffic.message_bytes, traffic.message_hz
     return (
-        _Flow("message", "robot", robots, hz, size, share * others),
+        _Flow("message", "robot", robots, hz, size, others),
         _Flow("status", "robot", robots, traffic.status_hz, status_bytes(1.0 + heard), 0.0, True),
         _Flow("explored", "robot", robots, EXPLORED.rate_hz, EXPLORED_BYTES, 0.0, True),
-        _Flow("card", "robot", robots, CARD.rate_hz, CARD_BYTES, share * others, True),
+        _Flow("card", "robot", robots, CARD.rate_hz, CARD_BYTES, others, True),
         _Flow("state", "ground", 1.0, state_hz(robots), state_bytes(robots), robots),
         _Flow("ground card", "ground", 1.0, GROUND_CARD.rate_hz, GROUND_CARD_BYTES, robots),
-        _Flow("guests' message", "wire", guests, hz, size, share * robots),
-        _Flow("guests' card", "wire", guests, CARD.rate_hz, CARD_BYTES, share * robots),
+        _Flow("guests' message", "wire", guests, hz, size, robots),
+        _Flow("guests' card", "wire", guests, CARD.rate_hz, CARD_BYTES, robots),
     )
 
 
@@ -524,15 +513,8 @@ def _message_us(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow
     ground_on_air = flow.to_ground and not wifi.ground_wired
     on_air = flow.robots + (1.0 if ground_on_air else 0.0)
     on_wire = 1.0 if flow.to_ground and wifi.ground_wired else 0.0
-    segments = _segments(flow.payload_bytes)
-    if not (transport == "router" and flow.source == "robot" and flow.robots):
-        up = on_air + on_wire if from_air else 0.0
-        return _connections_us(channel, segments, up=up, down=on_air)
-    if wifi.ground_wired:
-        return _connections_us(channel, segments, up=1.0, down=flow.robots)
-    # To the router, which hears it for the ground too, and from there as any station sends.
-    to_router = _connections_us(channel, segments, up=1.0, down=1.0)
-    return to_router.plus(_connections_us(channel, segments, up=flow.robots, down=flow.robots))
+    up = on_air + on_wire if from_air else 0.0
+    return _connections_us(channel, _segments(flow.payload_bytes), up=up, down=on_air)
 
 
 def _connections_us(channel: _Channel, segments: _Packets, *, up: float, down: float) -> _Use:

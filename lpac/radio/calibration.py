@@ -5,11 +5,11 @@
 
 - `data_rate_mbit_s` from the radios' rates: the one at which the same bytes take as long as at all
   of them, their harmonic mean. Where no radio told its rate, the one at which the model of a mesh
-  or a router keeps the channel as busy as it was.
+  keeps the channel as busy as it was.
 - `multicast_rate_mbit_s`, if the data rate is known so: the one at which the model of multicast
   keeps the channel as busy as it was.
-- `frame_loss` from multicast: the one at which the model delivers as much as arrived. In a mesh and
-  with a router what is lost is repeated, so that nobody sees it.
+- `frame_loss` from multicast: the one at which the model delivers as much as arrived. In a mesh
+  what is lost is repeated, so that nobody sees it.
 
 The rest stays assumed: what a full queue is worth would take a channel that somebody fills, whose
 traffic is in no record. For the same reason records beside a bulk stream are left out. Each record
@@ -129,22 +129,22 @@ def _data_rate(records: Sequence[RadioRecord], wifi: Wifi) -> _Found | None:
     rates = [each.rate_mbit_s for each in records if each.rate_mbit_s is not None]
     if rates:
         return _Found(harmonic_mean(rates), Source(SourceKind.RATES, len(rates)))
-    return _by_busy("data_rate_mbit_s", records, ("mesh", "router"), wifi)
+    return _by_busy("data_rate_mbit_s", records, "mesh", wifi)
 
 
 def _multicast_rate(records: Sequence[RadioRecord], wifi: Wifi) -> _Found | None:
     if _data_rate(records, wifi) is None:
         return None
-    return _by_busy("multicast_rate_mbit_s", records, ("multicast",), wifi)
+    return _by_busy("multicast_rate_mbit_s", records, "multicast", wifi)
 
 
 def _by_busy(
-    name: str, records: Sequence[RadioRecord], transports: Sequence[Transport], wifi: Wifi
+    name: str, records: Sequence[RadioRecord], transport: Transport, wifi: Wifi
 ) -> _Found | None:
     told = [
         each
         for each in records
-        if each.transport in transports and each.busy_share is not None and _is_quiet(each)
+        if each.transport == transport and each.busy_share is not None and _is_quiet(each)
     ]
     busy = _means(told, lambda record: record.busy_share or 0.0)
 

@@ -12,7 +12,7 @@ from lpac.radio.airtime import Wifi, airtime, carries
 from lpac.radio.checked import Checked, WifiReading
 from lpac.radio.pairs import LATE_S, Pair, blame
 
-# Mesh and router repeat what is lost until it is through, so that nothing should be missing. Where
+# A mesh repeats what is lost until it is through, so that nothing should be missing. Where
 # more is, the radio is at fault; in multicast, more than chance makes of what each frame may lose.
 LEAST_DELIVERED = 0.95
 _CHANCE_DEVIATIONS = 3.0

@@ -13,8 +13,7 @@ from edge.core.wire import MAX_ROBOT_ID, PayloadType
 from edge.core.world import Feature, random_features
 from edge.flight.margins import ErrorBudget
 from edge.policy.bundle import Bundle, BundleError
-from lpac.fleet.settings import Transport
-from lpac.radio.airtime import LinkQuality
+from lpac.radio.airtime import LinkQuality, Transport
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName
 from lpac.sim.description import ERRORS, FIELD_SCALE

@@ -38,7 +38,7 @@ ALLOWED = {
     "lpac.analysis": _EDGE,
     "lpac.ground": {*_EDGE, "lpac.analysis", "lpac.fleet.settings", "lpac.radio"},
     # What describes a fleet; the ground reads it, and the simulator describes its fleets with it.
-    "lpac.fleet.settings": _EDGE,
+    "lpac.fleet.settings": {*_EDGE, "lpac.radio"},
     "lpac.fleet.writer": {*_EDGE, "lpac.fleet.settings"},
     "lpac.fleet.authority": _EDGE,
     "lpac.fleet": {

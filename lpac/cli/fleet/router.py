@@ -1,4 +1,4 @@
-"""`lpac fleet router`: what the robots of a fleet meet at, where its radio has one."""
+"""`lpac fleet router`: connects a fleet in multicast with its ground stations."""
 
 import signal
 
@@ -10,7 +10,7 @@ from lpac.cli.options import DEFAULT_FLEET, Fleet
 def router(fleet: Fleet = DEFAULT_FLEET) -> None:
     """Pass on what robots and ground stations say, until Ctrl-C.
 
-    For `transport = "router"` in [radio]: on the computer that has the address named there, on a
+    For `transport = "multicast"` in [radio]: on the computer that has the address named there, on a
     wire to the access point. `lpac ground` may come and go meanwhile.
     """
     from edge.drivers.stop import Stop

@@ -152,8 +152,8 @@ class Fleet:
 
     `layout` is what it is, `robots[i]` is robot i's process, `heard` what they say. `simulated` are
     the vehicles themselves, for whoever wants to do something to them; None where they are real
-    PX4. `endpoints` are the robots' zenoh addresses, `router` the program that they meet at where
-    they are its clients, `name` the fleet's. `carried` is how many robots this machine was found to
+    PX4. `endpoints` are the robots' zenoh addresses, `router` the program by which they reach the
+    ground in multicast, `name` the fleet's. `carried` is how many robots this machine was found to
     carry; who finds it out says so. `fleet_toml` describes the fleet to `lpac ground`, as if its
     robots were in the field.
     """
@@ -190,12 +190,15 @@ class Fleet:
         *ports, router_port = free_ports(scenario.robots + 1)
         scheme = "tls" if scenario.secure else "tcp"
         self.endpoints = tuple(f"{scheme}/127.0.0.1:{port}" for port in ports)
-        router = None if scenario.transport == "mesh" else f"127.0.0.1:{router_port}"
-        self.router = None if router is None else RouterProcess(self.fleet_toml, router_port)
-        radio = {} if router is None else {"transport": scenario.transport, "router": router}
+        self.router: RouterProcess | None = None
+        connect, radio = self.endpoints, {}
         if scenario.transport == "multicast":
-            # Of its own: another fleet's datagrams would be looked at, too.
-            radio["group"] = f"239.255.76.80:{router_port}"
+            self.router = RouterProcess(self.fleet_toml, router_port)
+            router = f"127.0.0.1:{router_port}"
+            connect = (f"{scheme}/{router}",)
+            # A group of its own: another fleet's datagrams would be looked at, too.
+            group = f"239.255.76.80:{router_port}"
+            radio = {"transport": "multicast", "router": router, "group": group}
         self.name = f"sim-{ports[0]}"
         self.robots = tuple(
             RobotProcess(robot, self.folder / "robots" / str(robot))
@@ -206,8 +209,8 @@ class Fleet:
         keys = write_keys(self.folder, self.name, scenario.robots) if scenario.secure else None
         self.heard = FleetListener(
             fleet=self.name,
-            connect=self.endpoints if router is None else (f"{scheme}/{router}",),
-            mode="peer" if router is None else "client",
+            connect=connect,
+            mode="peer" if self.router is None else "client",
             identity=keys,
             say=self.say_unless_behind,
         )

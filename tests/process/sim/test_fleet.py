@@ -81,7 +81,7 @@ def read_until(stream: IO[str] | None, pattern: str) -> re.Match[str]:
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """Flown until Ctrl-C; other fleets of this folder fly to the end of their missions."""
     out = tmp_path_factory.mktemp("fleet")
-    # Other missions of this folder are flown in a mesh, and by way of a router.
+    # Other missions of this folder are flown in a mesh.
     with launched(
         "-n", ROBOTS, "--json", "--out", out, "--secure", "--transport", "multicast",
     ) as process:  # fmt: skip
@@ -175,8 +175,8 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
 
 
 @pytest.mark.real_time
-def test_a_fleet_meets_at_its_router_and_finds_it_again(tmp_path: Path) -> None:
-    scenario = Scenario(robots=2, secure=True, transport="router")
+def test_a_fleet_in_multicast_finds_its_router_again(tmp_path: Path) -> None:
+    scenario = Scenario(robots=2, secure=True, transport="multicast")
     with Fleet(scenario, tmp_path, SHIPPED) as fleet:
         config = load_ground(fleet.fleet_toml, None)
         assert config.mode == "client" and len(config.connect) == 1
@@ -215,7 +215,7 @@ def test_a_pilot_takes_a_robot_out_of_the_fence_and_back(tmp_path: Path) -> None
     """As tests/sim/sim/test_pilot.py has it on the simulated clock."""
     taken = Failure(robot=0, from_s=1.0, until_s=19.0)
     scenario = Scenario(
-        robots=2, seed=3, duration_s=22.0, secure=True, transport="router", budget=PRECISE,
+        robots=2, seed=3, duration_s=22.0, secure=True, transport="multicast", budget=PRECISE,
         failures=(taken,),
     )  # fmt: skip
     [record] = engine_of("mavlink").fly([scenario], SHIPPED, tmp_path)

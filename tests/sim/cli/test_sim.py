@@ -28,10 +28,10 @@ def test_sim_json_is_the_same_twice() -> None:
 def test_sim_flies_with_the_radio_of_a_field(tmp_path: Path) -> None:
     wifi = tmp_path / "wifi.toml"
     wifi.write_text("data_rate_mbit_s = 54\n")
-    options = ("--duration", 1, "--robots", 30, "--transport", "router", "--wifi", wifi)
+    options = ("--duration", 1, "--robots", 30, "--transport", "multicast", "--wifi", wifi)
     result = called("sim", *options)
     assert result.returncode == 0, result.stderr
-    assert "\nrouter: by the model " in result.stdout
+    assert "\nmulticast: by the model " in result.stdout
     assert "data_rate_mbit_s = 54  # from the file\n" in result.stdout
     assert "frame_loss = 0.05  # assumed\n" in result.stdout
     link = json.loads(called("sim", *options, "--json").stdout)["link"]

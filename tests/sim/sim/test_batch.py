@@ -133,7 +133,7 @@ def test_robots_that_see_what_they_explored_fly_the_same(
     [
         Scenario(seed=2, robots=4, loss=0.3, payload="float32"),
         Scenario(seed=3, robots=40, duration_s=3.0, world_size=1024, communication_range=128.0),
-        Scenario(seed=4, robots=30, duration_s=5.0, radio=ModelledRadio("router", SLOW)),
+        Scenario(seed=4, robots=30, duration_s=5.0, radio=ModelledRadio("multicast", SLOW)),
         dataclasses.replace(HARD, duration_s=20.0),
     ],
     ids=[

@@ -218,7 +218,7 @@ def test_with_a_modelled_radio_messages_are_lost_and_late_as_it_says(
 ) -> None:
     scenario = a_scenario(
         robots=40, starts_m=((16.0, 16.0),) * 40,
-        radio=ModelledRadio("router", Wifi(data_rate_mbit_s=60.0)), duration_s=3.0,
+        radio=ModelledRadio("mesh", Wifi(data_rate_mbit_s=60.0)), duration_s=3.0,
     )  # fmt: skip
     flown, link = fly_points(scenario, shipped_bundle), scenario.link
     assert 0.1 < link.loss < 0.9 and link.delay_s > 0.1
@@ -226,7 +226,7 @@ def test_with_a_modelled_radio_messages_are_lost_and_late_as_it_says(
     assert lost / heard == pytest.approx(link.loss, abs=0.02)
     told = summary(scenario, flown)["link"]
     assert (told["loss"], told["delay_s"]) == link
-    assert told["by_model"]["transport"] == "router"
+    assert told["by_model"]["transport"] == "mesh"
     assert told["by_model"]["wifi"]["data_rate_mbit_s"] == 60.0
     assert summary(a_scenario(), short(shipped_bundle))["link"]["by_model"] is None
 

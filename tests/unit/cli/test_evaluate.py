@@ -21,7 +21,6 @@ from tests.conftest import SHIPPED
         ({"lost": ["2"]}, "lost robots '2': must be ROBOTS@SECONDS, such as 2@20"),
         ({"lost": ["2@60"]}, "robots lost at 60 s: must be in flight"),
         ({"losses": [1.5]}, "loss = 1.5: must be from 0 to 1"),
-        ({"transports": ["pigeon"]}, "--transport pigeon: must be one of mesh, router, multicast"),
         ({"transports": ["mesh"], "losses": [0.1]}, "--loss and --transport: the model itself"),
         ({"wifi": Path("wifi.toml")}, "--wifi does nothing without --transport"),
         ({"transports": ["mesh"], "wifi": Path("w.yaml")}, "w.yaml: must be a .toml file"),

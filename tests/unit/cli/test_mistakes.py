@@ -68,3 +68,10 @@ from tests.conftest import SHIPPED
 )
 def test_a_mistake_is_one_line(arguments: list[str], text: str) -> None:
     assert text in error_line(called(*arguments))
+
+
+@pytest.mark.parametrize("command", ["sim", "evaluate"])
+def test_an_unknown_transport_is_told_with_those_that_are(command: str) -> None:
+    result = called(command, "--transport", "router")
+    assert result.returncode == 2
+    assert "'router' is not one of 'mesh', 'multicast'" in result.stderr

@@ -201,7 +201,7 @@ def test_a_wrong_clock(config: FleetConfig, ahead_s: float, verdict: str, found:
 
 
 def test_who_does_not_reach_the_router_is_told_to_start_it(config: FleetConfig) -> None:
-    routed = dataclasses.replace(config, radio=RadioConfig("router", "192.168.8.2:7447"))
+    routed = dataclasses.replace(config, radio=RadioConfig("multicast", "192.168.8.2:7447"))
     for peers, verdict, fix in ((1, "ok", ""), (0, "warning", "lpac fleet router")):
         fleet = {name: well(routed, name) for name in ("r1", "r2", "r3")}
         fleet["r1"].facts["service"]["status"]["peers"] = peers

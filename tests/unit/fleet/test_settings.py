@@ -162,32 +162,24 @@ def test_a_robot_gets_what_is_its_own(tmp_path: Path) -> None:
     assert str(tmp_path) not in robot_toml(config, "r3")
 
 
-def test_with_a_router_all_are_its_clients(tmp_path: Path) -> None:
-    config = load_fleet(fleet_file(tmp_path, with_router("192.168.8.2:7447")))
-    for name in ("r1", "r3"):
+def test_with_multicast_robots_are_in_a_group_and_clients_of_the_router(tmp_path: Path) -> None:
+    config = load_fleet(fleet_file(tmp_path, in_multicast("192.168.8.2:7447")))
+    for name, address in (("r1", "192.168.8.11"), ("r3", "192.168.8.13")):
         link = rendered(config, name, tmp_path).link
         assert (link.mode, link.listen, link.connect) == (
             "client", (), ("tls/192.168.8.2:7447",),
         )  # fmt: skip
+        assert (link.group, link.interface) == ("239.255.76.80:7450", address)
+        assert link.leaves_machine
     assert (config.mode, config.everybody) == ("client", ("tls/192.168.8.2:7447",))
     mesh = load_fleet(fleet_file(tmp_path, example()))
     assert (mesh.mode, mesh.router) == ("peer", None)
     assert mesh.everybody[0] == "tls/192.168.8.11:7447" and len(mesh.everybody) == 4
 
 
-def test_with_multicast_robots_are_in_a_group_too(tmp_path: Path) -> None:
-    text = with_router("192.168.8.2:7447").replace('"router"', '"multicast"')
-    config = load_fleet(fleet_file(tmp_path, text))
-    assert (config.mode, config.everybody) == ("client", ("tls/192.168.8.2:7447",))
-    link = rendered(config, "r3", tmp_path).link
-    assert (link.mode, link.connect) == ("client", ("tls/192.168.8.2:7447",))
-    assert (link.group, link.interface) == ("239.255.76.80:7450", "192.168.8.13")
-    assert link.leaves_machine
-
-
 def test_a_radio_of_ones_own_is_told_what_the_built_in_one_is(tmp_path: Path) -> None:
-    text = with_router("192.168.8.2:7447").replace(
-        'transport = "router"', 'transport = "router"\ntype = "lora"\noptions = {channel = 7}'
+    text = in_multicast("192.168.8.2:7447").replace(
+        'transport = "multicast"', 'transport = "multicast"\ntype = "lora"\noptions = {channel = 7}'
     )
     link = rendered(load_fleet(fleet_file(tmp_path, text)), "r3", tmp_path).link
     assert (link.type, link.options) == ("lora", {"channel": 7})
@@ -206,16 +198,16 @@ def test_what_says_nothing_of_a_radio_is_refused(tmp_path: Path, lines: str, tol
         load_fleet(fleet_file(tmp_path, example("# [radio]", f"[radio]\n{lines}\n")))
 
 
-def with_router(place: str) -> str:
-    return example("# [radio]", f'[radio]\ntransport = "router"\nrouter = "{place}"\n')
+def in_multicast(place: str) -> str:
+    return example("# [radio]", f'[radio]\ntransport = "multicast"\nrouter = "{place}"\n')
 
 
 def test_robots_elsewhere_need_keys_though_their_router_is_here(tmp_path: Path) -> None:
-    assert load_fleet(fleet_file(tmp_path, with_router("127.0.0.1:7447"))).keys is not None
+    assert load_fleet(fleet_file(tmp_path, in_multicast("127.0.0.1:7447"))).keys is not None
 
 
 def test_robots_of_this_computer_need_keys_if_their_router_is_elsewhere(tmp_path: Path) -> None:
-    here = re.sub(r"192\.168\.8\.(\d+)", r"127.0.0.\1", with_router("127.0.0.1:7447"))
+    here = re.sub(r"192\.168\.8\.(\d+)", r"127.0.0.\1", in_multicast("127.0.0.1:7447"))
     here = re.sub(r'host = "127\.0\.0\.(\d+)"', r'host = "127.0.0.\1"', here)
     config = load_fleet(fleet_file(tmp_path, here))
     assert config.keys is None
@@ -324,18 +316,25 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ('fleet = "demo"', "", ["fleet is missing"]),
         ('fleet = "demo"', 'fleet = "a b"', ["fleet = 'a b'", "letters"]),
         ("# [radio]", '[radio]\ntransport = "air"\n#', ["radio: transport = 'air'", "'mesh'"]),
-        ("# [radio]", '[radio]\ntransport = "router"\n#', ["radio: transport = 'router'", "where"]),
+        (
+            "# [radio]", '[radio]\ntransport = "router"\nrouter = "10.0.0.1:1"\n#',
+            ["radio: transport = 'router': allowed are 'mesh', 'multicast'"],
+        ),
+        (
+            "# [radio]", '[radio]\ntransport = "multicast"\n#',
+            ["radio: transport = 'multicast'", "where"],
+        ),
         ("# [radio]", '[radio]\nrouter = "10.0.0.1:1"\n#', ["transport = 'mesh'", "left out"]),
         (
             "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "10.0.0.1:1"\n'
             'group = "10.0.0.2:7450"\n#', ["radio: group = '10.0.0.2:7450'", "239.255.76.80:7450"],
         ),
         (
-            "# [radio]", '[radio]\ntransport = "router"\nrouter = "laptop:7447"\n#',
+            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "laptop:7447"\n#',
             ["radio: router = 'laptop:7447'", "192.168.8.2:7447"],
         ),
         *(
-            ("# [radio]", f'[radio]\ntransport = "router"\nrouter = "{router}"\n#',
+            ("# [radio]", f'[radio]\ntransport = "multicast"\nrouter = "{router}"\n#',
              [f"radio: router = '{router}'", "a computer's own IPv4", "1 to 65535", "192.168.8.2"])
             for router in ("0.0.0.0:7447", "239.255.76.80:7450", "255.255.255.255:1", "10.0.0.1:0")
         ),
@@ -393,11 +392,11 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
             ["robots.r1: mavlink_url = '127.0.0.011': looks like an address"],
         ),
         (
-            "# [radio]", '[radio]\ntransport = "router"\nrouter = "192.168.8.011:7447"\n#',
+            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "192.168.8.011:7447"\n#',
             ["radio: router = '192.168.8.011': looks like an address"],
         ),
         (
-            "# [radio]", '[radio]\ntransport = "router"\nrouter = "192.168.8.2:\u0667"\n#',
+            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "192.168.8.2:\u0667"\n#',
             ["radio: router = '192.168.8.2:\u0667': must be"],
         ),
         (

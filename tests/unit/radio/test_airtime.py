@@ -57,7 +57,6 @@ traffics = st.builds(
     message_bytes=st.floats(100.0, 20_000.0),
     message_hz=st.floats(0.0, 20.0),
     status_hz=st.floats(0.0, 4.0),
-    neighbours=st.none() | st.floats(0.0, 100.0),
 )
 transports = st.sampled_from(TRANSPORTS)
 
@@ -112,14 +111,6 @@ def test_one_segment_of_a_mesh_of_two_goes_up_and_down_and_so_does_its_acknowled
     assert 1e6 * found.message_s == pytest.approx(expected_us, rel=2e-3)
 
 
-def test_a_router_on_a_wire_is_told_once_and_acknowledges_it() -> None:
-    packet_bytes = 1000 + 27 + 22 + 52
-    up_us = unicast_us(packet_bytes, 220.0) + unicast_us(52, 220.0)
-    found = airtime("router", LOSSLESS, Traffic(robots=4, message_bytes=1000.0))
-    # Up once, and down three times.
-    assert 1e6 * found.message_s == pytest.approx(4.0 * up_us, rel=5e-3)
-
-
 def test_a_message_too_large_for_a_datagram_takes_two_turns_of_a_group() -> None:
     small, large = (
         airtime("multicast", LOSSLESS, Traffic(robots=2, message_bytes=size))
@@ -167,25 +158,7 @@ def test_multicast_pays_from_a_few_robots_on() -> None:
     slow = replace(WIFI, multicast_rate_mbit_s=6.0)
     two, ten = Traffic(robots=2), Traffic(robots=10)
     assert total("multicast", slow, two) > total("mesh", slow, two)
-    assert total("multicast", slow, ten) < total("router", slow, ten) < total("mesh", slow, ten)
-
-
-def test_a_router_in_the_wifi_costs_as_much_as_a_mesh() -> None:
-    on_air = replace(WIFI, ground_wired=False)
-    assert total("router", on_air) == pytest.approx(total("mesh", on_air), rel=0.15)
-    assert total("router", WIFI) < 0.8 * total("router", on_air)
-
-
-def test_sending_on_to_neighbours_alone_takes_what_they_are() -> None:
-    hundred = Traffic(robots=100)
-    near = airtime("router", WIFI, replace(hundred, neighbours=8.0))
-    all_ = airtime("router", WIFI, hundred)
-    assert near.shares["message"] < all_.shares["message"] / 8
-    assert near.shares["card"] < all_.shares["card"] / 4
-
-
-def test_more_neighbours_than_there_are_is_all() -> None:
-    assert total("router", WIFI, replace(TEN, neighbours=50.0)) == total("router")
+    assert total("multicast", slow, ten) < total("mesh", slow, ten)
 
 
 def test_guests_are_sent_down_only() -> None:
@@ -298,8 +271,8 @@ def test_a_cell_with_its_guests_fits_and_one_larger_does_not() -> None:
 
 def test_where_one_robot_is_too_many_no_cells_help() -> None:
     slow = Wifi(data_rate_mbit_s=0.01)
-    assert cells("router", slow, TEN, **PLACE) is None
-    assert carries("router", slow, TEN) == 0
+    assert cells("multicast", slow, TEN, **PLACE) is None
+    assert carries("multicast", slow, TEN) == 0
 
 
 def test_guests_stand_around_a_cell() -> None:
@@ -336,7 +309,6 @@ def test_an_impossible_channel_is_named(name: str, value: Any, allowed: str) -> 
         ("message_bytes", 0.0, "above 0"),
         ("message_hz", math.inf, "finite"),
         ("status_hz", -2.0, "at least 0"),
-        ("neighbours", math.nan, "at least 0"),
         ("guests", -1, "at least 0"),
     ],
 )
@@ -347,7 +319,7 @@ def test_impossible_traffic_is_named(name: str, value: Any, allowed: str) -> Non
 
 def test_impossible_questions_are_named() -> None:
     unknown: Any = "pigeon"
-    with pytest.raises(ValueError, match=r"^transport = 'pigeon': allowed are 'mesh', 'router'"):
+    with pytest.raises(ValueError, match=r"^transport = 'pigeon': allowed are 'mesh', 'multicast'"):
         airtime(unknown, WIFI, TEN)
     with pytest.raises(ValueError, match=r"^guests = 3: must be 0 in a mesh"):
         airtime("mesh", WIFI, replace(TEN, guests=3))

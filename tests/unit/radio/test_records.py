@@ -88,7 +88,7 @@ def test_a_line_has_all_keys_and_may_lack_what_is_not_known(tmp_path: Path) -> N
         ({"busy_share": 1.01}, "busy_share = 1.01: must be from 0 to 1"),
         ({"message_hz": None}, "message_hz = None: expected float"),
         ({"message_hz": 10**400}, "message_hz: is too large a number"),
-        ({"transport": "pigeon"}, "transport = 'pigeon': allowed are 'mesh', 'router', 'multi"),
+        ({"transport": "router"}, "transport = 'router': allowed are 'mesh', 'multicast'"),
         ({"loaded": None}, "loaded = None: expected bool"),
         ({"colour": "red"}, "unknown key 'colour'"),
     ],

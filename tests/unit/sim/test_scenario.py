@@ -23,7 +23,7 @@ from tests.conftest import SHIPPED
         ("errors", False, "errors = False: must be True"),
         ("sensor", "camera", "sensor = camera: must be world"),
         ("secure", True, "secure = True: must be False"),
-        ("transport", "router", "transport = router: must be mesh"),
+        ("transport", "multicast", "transport = multicast: must be mesh"),
     ],
 )
 def test_points_have_no_vehicles_sensors_or_keys(field: str, asked: Any, named: str) -> None:
@@ -51,8 +51,10 @@ def test_whole_robots_fly_as_they_do_in_the_field(scenario: Scenario, named: str
 
 
 def test_a_radio_is_simulated_or_real(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"^transport = router: must be mesh for robots on a sim"):
-        fly_simulated(Scenario(transport="router"), tmp_path, SHIPPED)
+    with pytest.raises(
+        ValueError, match=r"^transport = multicast: must be mesh for robots on a sim"
+    ):
+        fly_simulated(Scenario(transport="multicast"), tmp_path, SHIPPED)
     with pytest.raises(ValueError, match=r"^loss = 0.1: must be 0.0 for programs in real time"):
         Fleet(Scenario(loss=0.1), tmp_path, SHIPPED)
     assert not list(tmp_path.iterdir())
