@@ -152,7 +152,7 @@ def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
     ]
     study = Study(
         methods=_methods(given, options.baselines),
-        conditions=tuple(conditions),
+        conditions=tuple(dict.fromkeys(conditions)),
         world_set=next(known for known in WORLD_SETS if known == options.world_set),
         worlds=options.worlds,
         px4_build="" if options.px4 is None else str(options.px4.resolve()),

@@ -55,7 +55,10 @@ def study(
 
         fly_faults(read_drill(file), out or _OUT / file.stem, px4, ray, as_json=as_json)
         return
-    task = StudyTask(name=file.stem, study=read_study(file, px4), folder=out or _OUT / file.stem)
+    read = read_study(file, px4)
+    if px4 is not None and all(condition.engine != "px4" for condition in read.conditions):
+        raise ValueError(f"--px4 does nothing: no condition of {file} has engine = 'px4'")
+    task = StudyTask(name=file.stem, study=read, folder=out or _OUT / file.stem)
     fly_study(task, ray, as_json=as_json)
 
 

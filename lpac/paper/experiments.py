@@ -31,7 +31,7 @@ def experiment(
         study = replace(study, methods=methods)
     if set_ups:
         conditions = (condition_of({"set_up": its, "title": its}, "--set-up") for its in set_ups)
-        study = replace(study, conditions=tuple(conditions))
+        study = replace(study, conditions=tuple(dict.fromkeys(conditions)))
     return study if engine == "point" else _whole(name, study, engine)
 
 
@@ -49,7 +49,8 @@ def _whole(name: str, study: Study, engine: EngineName) -> Study:
             continue
         conditions.append(replace(condition, engine=engine))
         if name in ("e1", "transfer"):
-            conditions.append(replace(condition, from_pads=True))
+            title = condition.title and f"{condition.title}, points from pads"
+            conditions.append(replace(condition, from_pads=True, title=title))
     worlds = study.worlds
     if name in _FEWER:
         worlds = 1 if engine in IN_REAL_TIME else max(1, study.worlds // _FEWER[name])

@@ -58,7 +58,7 @@ class LostRobots(NamedTuple):
         """Of "2@20". Raises ValueError."""
         found = _LOST.fullmatch(text)
         if found is None:
-            raise ValueError(f"lost robots {text!r}: must be ROBOTS@SECONDS, such as 2@20")
+            raise ValueError(f"lost = {text!r}: must be ROBOTS@SECONDS, such as 2@20")
         return cls(int(found[1]), float(found[2]))
 
     def failures(self, of_robots: int) -> tuple[Failure, ...]:

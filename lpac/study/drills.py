@@ -4,7 +4,7 @@ import os
 import signal
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from edge.core.logger import show
-from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, from_mapping
+from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, ConfigError, from_mapping
 from edge.core.toml import read_toml
 from edge.drivers.registry import open_sensor
 from edge.policy.bundle import load_bundle
@@ -105,7 +105,15 @@ def read_drill(path: Path) -> Drill:
 
     Raises ConfigError that names file, key, value and what is allowed.
     """
-    drill = from_mapping(Drill, read_toml(path), str(path))
+    table = read_toml(path)
+    known = [each.name for each in fields(Drill)]
+    for key in table:
+        if key not in known:
+            raise ConfigError(
+                f"{path}: unknown key {key!r}: a file with `faults` is a drill, whose keys are "
+                f"{', '.join(known)}"
+            )
+    drill = from_mapping(Drill, table, str(path))
     return replace(drill, bundle=str(path.parent / drill.bundle))
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type
 
 from msgspec import Meta
 
-from edge.core.schema import AtLeastOne, Bounded, ConfigError, NonNegative, from_mapping
+from edge.core.schema import Bounded, ConfigError, from_mapping
 from edge.core.toml import read_toml
 from edge.core.world import parse_world
 from lpac.shipped import SHIPPED_BUNDLE
@@ -16,7 +16,18 @@ from lpac.sim.baselines import BaselineName
 from lpac.sim.engines import EngineName
 from lpac.sim.failure import NONE_LOST, LostRobots
 from lpac.sim.scenario import Scenario
-from lpac.study.study import USUAL_FIGURES, Condition, Figure, Method, Study
+from lpac.study.study import (
+    USUAL_FIGURES,
+    Condition,
+    ConditionError,
+    Figure,
+    Method,
+    Misplaced,
+    Study,
+    Trials,
+    WorldNumber,
+    Worlds,
+)
 from lpac.study.worlds import SET_UPS, WorldSet
 
 
@@ -40,18 +51,18 @@ class StudyFile(Bounded):
         tuple[BaselineName, ...], "Beside clairvoyant-cvt, which always flies."
     ] = ()
     world_set: Annotated[WorldSet, "Look at test only once."] = "validation"
-    first_world: Annotated[int, Meta(ge=0), "Number of the first world of the set."] = 0
-    worlds: Annotated[AtLeastOne, "How many, from the first on."] = 20
+    first_world: Annotated[WorldNumber, "Number of the first world of the set."] = 0
+    worlds: Annotated[Worlds, "How many, from the first on."] = 20
     starts: Annotated[
         Literal["own", "first"],
         "Where robots start: in each world where its number says, or where the first one's do.",
     ] = "own"
-    trials: Annotated[AtLeastOne, "How often each world is flown."] = 1
+    trials: Annotated[Trials, "How often each world is flown."] = 1
     placed_within_m: Annotated[
-        NonNegative, "How far from the same starts robots are placed in each trial, m."
+        Misplaced, "How far from the same starts robots are placed in each trial, m."
     ] = 0.0
     receiver_error_m: Annotated[
-        tuple[NonNegative, NonNegative] | None,
+        tuple[Misplaced, Misplaced] | None,
         "[least, greatest]: how wrong the positions of points are throughout a trial, m.",
     ] = None
     scenario: Annotated[dict[str, object], "What all flights have alike: see below."] = field(
@@ -77,7 +88,9 @@ class ConditionKeys:
         bool, "Points begin on the pads of whole robots, as wrong about their places as these."
     ] = False
     lost: Annotated[str, "Points lost in flight, ROBOTS@SECONDS, such as 2@20."] = ""
-    methods: Annotated[tuple[str, ...], "Names of those that fly it; else all."] = ()
+    methods: Annotated[
+        tuple[str, ...], Meta(min_length=1), "Names of those that fly it; else all."
+    ] = ()
     set_up: Annotated[
         str, "Team and world, from which other keys differ: field, n32, paper, ..."
     ] = "field"
@@ -107,20 +120,20 @@ def read_study(
         ]
     except ValueError as error:
         raise ConfigError(f"{where}: policies: {error}") from None
-    for keys in _combinations(file.scenario):
+    for keys in _combinations(file.scenario, f"{where}: scenario"):
         condition_of(keys, f"{where}: scenario", path.parent)
-    conditions = [
-        condition_of(
-            {"title": _title(change), **keys}, f"{where}: conditions[{number}]", path.parent
-        )
-        for number, changes in enumerate(file.conditions)
-        for change in _combinations(changes)
-        for keys in _combinations(merged(file.scenario, change))
-    ]
+    # A condition given in two ways is flown once.
+    places: dict[Condition, str] = {}
+    for number, changes in enumerate(file.conditions):
+        place, whole = f"{where}: conditions[{number}]", merged(file.scenario, changes)
+        place = place if file.conditions != ({},) else f"{where}: scenario"
+        for keys in _combinations(whole, place):
+            titled = {**keys, "title": _title(keys, whole, changes)}
+            places.setdefault(condition_of(titled, place, path.parent), place)
     try:
         return Study(
             methods=tuple(methods),
-            conditions=tuple(dict.fromkeys(conditions)),
+            conditions=tuple(places),
             world_set=file.world_set,
             first_world=file.first_world,
             worlds=file.worlds,
@@ -134,6 +147,8 @@ def read_study(
             sizes_from=str(bundle),
             px4_build="" if px4_build is None else str(px4_build.resolve()),
         )
+    except ConditionError as error:
+        raise ConfigError(f"{places[error.condition]}: {error}") from None
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
 
@@ -155,6 +170,9 @@ def condition_of(keys: Mapping[str, object], where: str, folder: Path = Path()) 
             path = folder / own.world
             features = parse_world(path.read_text("utf-8-sig"), str(path))
             scenario = replace(scenario, features=features)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{where}: world = {own.world!r}: {error}") from None
+    try:
         return Condition(
             scenario=scenario,
             engine=own.engine,
@@ -167,13 +185,34 @@ def condition_of(keys: Mapping[str, object], where: str, folder: Path = Path()) 
         raise ConfigError(f"{where}: {error}") from None
 
 
-def _title(change: Mapping[str, Any]) -> str:
-    """What is otherwise, for people; nothing if nothing is."""
+def _title(keys: Mapping[str, Any], whole: Mapping[str, Any], changes: Mapping[str, Any]) -> str:
+    """The given one, and what is otherwise; nothing if neither is."""
+    given = keys.get("title", "")
+    told = _otherwise(keys, whole, {} if given else changes)
+    return ", ".join(filter(None, [given, _said({**told, "title": ""})]))
+
+
+def _otherwise(
+    keys: Mapping[str, Any], whole: Mapping[str, Any], changes: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Of one combination of `whole` those keys that are one of several values, or changes."""
+    told = {}
+    for key, value in keys.items():
+        if isinstance(value, Mapping):
+            told[key] = _otherwise(value, whole[key], changes.get(key, {}))
+        elif key in changes or value != whole[key]:
+            told[key] = value
+    return told
+
+
+def _said(keys: Mapping[str, Any]) -> str:
+    """Keys and their values, for people."""
     parts = []
-    for key, value in change.items():
+    for key, value in keys.items():
         said = f"{value:g}" if isinstance(value, float) else f"{value}"
-        said = _title(value) if isinstance(value, Mapping) else said
-        parts.append(said if key == "set_up" else f"{key} {said}")
+        said = _said(value) if isinstance(value, Mapping) else said
+        if said:
+            parts.append(said if key == "set_up" else f"{key} {said}")
     return ", ".join(parts)
 
 
@@ -187,16 +226,24 @@ def merged(keys: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return told
 
 
-def _combinations(keys: Mapping[str, Any], cls: type = Scenario) -> Iterator[dict[str, Any]]:
-    """One for each combination of the values in lists that stand where one value should."""
+def _combinations(
+    keys: Mapping[str, Any], where: str, cls: type = Scenario
+) -> Iterator[dict[str, Any]]:
+    """One for each combination of the values in lists that stand where one value should.
+
+    Raises ConfigError for a list of none.
+    """
     hints = {**get_type_hints(ConditionKeys), **get_type_hints(cls)}
     choices: list[list[tuple[str, Any]]] = []
     for key, value in keys.items():
         hint = hints.get(key)
+        if value == [] and not _is_of_lists(hint):
+            raise ConfigError(f"{where}: {key} = []: must have a value at least")
         if isinstance(value, list) and not _is_of_lists(hint):
             choices.append([(key, each) for each in value])
         elif isinstance(value, Mapping) and is_dataclass(hint):
-            choices.append([(key, each) for each in _combinations(value, cast(type, hint))])
+            its = _combinations(value, f"{where}: {key}", cast(type, hint))
+            choices.append([(key, each) for each in its])
         else:
             choices.append([(key, value)])
     return map(dict, itertools.product(*choices))

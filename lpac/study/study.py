@@ -14,7 +14,9 @@ from msgspec import Meta
 
 from edge.core import F64
 from edge.core.counted import counted
-from edge.core.schema import AtLeastOne, Bounded, NonNegative
+from edge.core.schema import Bounded
+from edge.core.world import MOST_FEATURES
+from edge.drivers.registry import open_sensor
 from edge.policy.bundle import load_bundle
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.baselines import BaselineName
@@ -37,6 +39,23 @@ USUAL_FIGURES: tuple[Figure, ...] = ("curves", "distributions", "pairs", "condit
 _OF_RECORDS = ("snapshots", "repeatability", "perturbation")
 
 
+Worlds = Annotated[int, Meta(ge=1, le=10_000)]
+Trials = Annotated[int, Meta(ge=1, le=1000)]
+WorldNumber = Annotated[int, Meta(ge=0, le=1_000_000)]
+# How wrong a place may be, m.
+Misplaced = Annotated[float, Meta(ge=0.0, le=1000.0)]
+# In bytes: figures are in folders of these names.
+_LONGEST_NAME = 200
+
+
+class ConditionError(ValueError):
+    """No flight can be made under a condition of a study."""
+
+    def __init__(self, condition: "Condition", text: str) -> None:
+        super().__init__(text)
+        self.condition = condition
+
+
 class Draw(NamedTuple):
     """A world of the set, by its number, and which of the trials in it."""
 
@@ -53,10 +72,18 @@ class TrainedBundle(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """A baseline, or a policy by the bundles of its trainings, which differ in their seed alone."""
+    """A baseline, or a policy by the bundles of its trainings, which differ in their seed alone.
+
+    Raises ValueError for a policy with an impossible name, or a baseline's.
+    """
 
     name: str
     trainings: tuple[TrainedBundle, ...] = ()
+
+    def __post_init__(self) -> None:
+        _require_name("name", self.name)
+        if self.trainings and self.name in BASELINES:
+            raise ValueError(f"name = {self.name!r}: must be another, since a baseline has it")
 
     @property
     def trained(self) -> bool:
@@ -96,17 +123,32 @@ class Condition:
     title: str = ""
 
     def __post_init__(self) -> None:
-        SetUp.of(self.scenario)
-        duration_s, robots = self.scenario.duration_s, self.scenario.robots
-        if self.lost.robots and not 0.0 < self.lost.at_s < duration_s:
-            raise ValueError(f"robots lost at {self.lost.at_s:g} s: must be in flight")
+        scenario, lost = self.scenario, f"lost = {self.lost.robots}@{self.lost.at_s:g}"
+        count, robots = scenario.random_feature_count, scenario.robots
+        if not 1 <= count <= MOST_FEATURES:
+            raise ValueError(f"random_feature_count = {count}: must be from 1 to {MOST_FEATURES}")
+        world_m = SetUp.of(scenario).world_size / scenario.scale.env_scale
+        for place_m in scenario.starts_m or ():
+            if not all(0.0 <= each <= world_m for each in place_m):
+                raise ValueError(
+                    f"starts_m: {list(place_m)}: must be within the world, from 0 to {world_m:g} m"
+                )
+        if self.lost.robots and not 0.0 < self.lost.at_s < scenario.duration_s:
+            raise ValueError(f"{lost}: must be in flight, before {scenario.duration_s:g} s")
         if self.lost.robots >= robots:
-            raise ValueError(f"{self.lost.robots} robots lost: must be fewer than {robots}")
+            raise ValueError(f"{lost}: must be fewer than robots = {robots}")
+        _require_name("title", self.name)
 
     @property
     def name(self) -> str:
         """For people: its title, or else its set-up and what is otherwise than usual."""
         return self.title or ", ".join([self.set_up, *self._differences()])
+
+    @property
+    def folder(self) -> str:
+        """Of its figures, within the study's."""
+        kept = self.name.replace(",", "").replace("%", "percent")
+        return kept.replace(" ", "-").replace("/", "-")
 
     @property
     def set_up(self) -> str:
@@ -145,6 +187,19 @@ class Condition:
                 yield f"{each.name} = {_short(value)}"
         if self.engine != "point":
             yield _ENGINES[self.engine]
+
+
+def _require_name(key: str, name: str) -> None:
+    """Raise ValueError for what cannot be a folder's name, or stand in a figure."""
+    if (
+        not name.isprintable() or name.startswith(".") or "$" in name
+        or not 0 < len(name.encode()) <= _LONGEST_NAME
+    ):  # fmt: skip
+        shown = f"{name[:60]}..." if len(name) > 60 else name
+        raise ValueError(
+            f"{key} = {shown!r}: must be 1 to {_LONGEST_NAME} letters on one line, without $, and "
+            "begin with no dot"
+        )
 
 
 _ENGINES: dict[EngineName, str] = {
@@ -189,12 +244,12 @@ class Study(Bounded):
     methods: tuple[Method, ...]
     conditions: Annotated[tuple[Condition, ...], Meta(min_length=1)] = (Condition(),)
     world_set: WorldSet = "validation"
-    first_world: Annotated[int, Meta(ge=0)] = 0
-    worlds: AtLeastOne = 20
+    first_world: WorldNumber = 0
+    worlds: Worlds = 20
     starts: Literal["own", "first"] = "own"
-    trials: AtLeastOne = 1
-    placed_within_m: NonNegative = 0.0
-    receiver_error_m: tuple[NonNegative, NonNegative] | None = None
+    trials: Trials = 1
+    placed_within_m: Misplaced = 0.0
+    receiver_error_m: tuple[Misplaced, Misplaced] | None = None
     title: str = ""
     text: str = ""
     figures: tuple[Figure, ...] = USUAL_FIGURES
@@ -211,23 +266,55 @@ class Study(Bounded):
         names = [method.name for method in self.all_methods]
         if len(set(names)) < len(names):
             raise ValueError(f"methods {', '.join(names)}: each once")
-        for condition in self.conditions:
-            engine = self.engine_of(condition)
-            engine.require_able(condition.scenario)
-            if condition.scenario.fault:
-                raise ValueError(
-                    f"fault = {condition.scenario.fault}: no cost is judged under a fault; a drill "
-                    "flies it"
-                )
-            if engine.whole_robots and (condition.lost.robots or condition.from_pads):
-                raise ValueError("lost, from_pads: are of points alone")
-            for name in condition.methods:
-                if name not in names:
-                    raise ValueError(f"methods = {name!r}: must be one of {', '.join(names)}")
         tasks = {task_of(loaded_bundle(path)): path for path in self._bundles}
         if len(tasks) > 1:
             different = "; ".join(f"{path}: {task}" for task, path in tasks.items())
             raise ValueError(f"bundles of different tasks: {different}")
+        folders = set()
+        for condition in self.conditions:
+            try:
+                self._require(condition)
+                if condition.folder in folders:
+                    raise ValueError(f"title = {condition.name!r}: must be another for each")
+            except ValueError as error:
+                raise ConditionError(condition, str(error)) from None
+            folders.add(condition.folder)
+        if "repeatability" in self.figures and self.trials == 1:
+            raise ValueError("figures = 'repeatability': needs trials of at least 2")
+        first, policy = self.conditions[0], self.methods_of(self.conditions[0])[0]
+        away = [f for f in first.scenario.failures if f.from_s < first.scenario.duration_s]
+        if "perturbation" in self.figures and not (away and policy.trained):
+            raise ValueError(
+                "figures = 'perturbation': needs a policy, and failures in flight, under the first "
+                "condition"
+            )
+
+    def _require(self, condition: Condition) -> None:
+        """Raise ValueError for what cannot be flown under a condition, as far as one can know."""
+        engine, scenario = self.engine_of(condition), condition.scenario
+        engine.require_able(scenario)
+        if scenario.fault:
+            raise ValueError(
+                f"fault = {scenario.fault}: no cost is judged under a fault; a drill flies it"
+            )
+        if engine.whole_robots and condition.lost.robots:
+            raise ValueError(
+                f"lost = {condition.lost.robots}@{condition.lost.at_s:g}: must not be given for "
+                "whole robots; `failures` takes them out of the mission for a while"
+            )
+        if engine.whole_robots and condition.from_pads:
+            raise ValueError("from_pads = True: must be False for whole robots, which always do")
+        names = [method.name for method in self.all_methods]
+        for name in condition.methods:
+            if name not in names:
+                raise ValueError(f"methods = {name!r}: must be one of {', '.join(names)}")
+        for path in dict.fromkeys([self.sized_by, *self._bundles]):
+            scenario.perception_of(loaded_bundle(path))
+        if engine.whole_robots:
+            open_sensor(scenario.sensor, {}, loaded_bundle(self.sized_by).manifest)
+        # There is room for those on pads.
+        for method in self.methods_of(condition):
+            next(self.flights_of(method, condition, Draw(self.first_world)))
 
     @property
     def all_methods(self) -> tuple[Method, ...]:
@@ -266,7 +353,7 @@ class Study(Bounded):
         """What flies the policies. Raises ValueError without PX4's build where that is needed."""
         is_px4 = condition.engine == "px4"
         if is_px4 and not self.px4_build:
-            raise ValueError("engine = 'px4': needs PX4's build folder")
+            raise ValueError("engine = 'px4': needs PX4's build folder, --px4")
         return engine_of(condition.engine, Path(self.px4_build) if is_px4 else None)
 
     def methods_of(self, condition: Condition) -> tuple[Method, ...]:

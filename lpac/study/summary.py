@@ -193,7 +193,8 @@ def report_of(
 
 def _sections_of(study: Study, flown: Flown, folder: Path) -> list[Section]:
     """What the study's figures of whole flights and of rates show. Raises OSError, ValueError."""
-    condition, policy = study.conditions[0], study.all_methods[0]
+    condition = study.conditions[0]
+    policy = study.methods_of(condition)[0]
     first = {
         draw: flown.records.get(next(study.flights_of(policy, condition, draw)))
         for draw in study.draws
@@ -271,7 +272,7 @@ def draw_conditions(
     for condition, of_all in results.items():
         for figure, make in _OF_CONDITION.items():
             if figure in chosen:
-                path = f"{folder_of(condition)}/{figure}"
+                path = f"{condition.folder}/{figure}"
                 style.save(make(condition, of_all), folder / path)
                 shown.append(Picture(f"{path}.png", f"{condition.name}: {figure}"))
     return shown
@@ -282,13 +283,6 @@ _OF_CONDITION = {
     "distributions": figures.distributions,
     "pairs": figures.pairs,
 }
-
-
-def folder_of(condition: Condition) -> str:
-    """Of a condition's figures."""
-    return (
-        condition.name.replace(",", "").replace("%", "percent").replace(" ", "-").replace("/", "-")
-    )
 
 
 def draw_worst(

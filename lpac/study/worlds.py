@@ -10,12 +10,14 @@ at it, and then chooses, has no test set any more.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
+from msgspec import Meta
 
-from edge.core.world import GaussianFeature, random_features
-from lpac.sim.scenario import Scenario
+from edge.core.schema import Bounded, Positive
+from edge.core.world import MOST_FEATURES, GaussianFeature, random_features
+from lpac.sim.scenario import MAX_ROBOTS, Scenario
 
 WorldSet = Literal["training", "validation", "test"]
 WORLD_SETS: tuple[WorldSet, ...] = get_args(WorldSet)
@@ -27,29 +29,23 @@ _FEATURES, _STARTS, _FLIGHT = range(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SetUp:
+class SetUp(Bounded):
     """Sizes of a task, in model units; the sensor's and the local map's are the policy's.
 
     `sigma` are the least and the greatest standard deviation of features.
     Raises ValueError that names what is impossible.
     """
 
-    robots: int
-    world_size: int
-    communication_range: float
-    features: int
-    sigma: tuple[float, float] = (40.0, 60.0)
+    robots: Annotated[int, Meta(ge=1, le=MAX_ROBOTS)]
+    world_size: Annotated[int, Meta(ge=64, le=8192)]
+    communication_range: Positive
+    features: Annotated[int, Meta(ge=1, le=MOST_FEATURES)]
+    sigma: tuple[Positive, Positive] = (40.0, 60.0)
 
-    def __post_init__(self) -> None:
-        for name in ("robots", "world_size", "features"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be at least 1")
-        if not 0.0 < self.sigma[0] <= self.sigma[1] < math.inf:
-            raise ValueError(f"sigma = {self.sigma}: must be above 0, finite, and ascend")
-        if not 0.0 < self.communication_range < math.inf:
-            raise ValueError(
-                f"communication_range = {self.communication_range}: must be positive and finite"
-            )
+    def check_rules(self) -> None:
+        """See `Bounded`."""
+        if self.sigma[0] > self.sigma[1]:
+            raise ValueError(f"sigma = {self.sigma}: must be [least, greatest]")
 
     @property
     def sizes(self) -> dict[str, Any]:

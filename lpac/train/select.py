@@ -74,22 +74,23 @@ def flights_of(
 
     They are over validation worlds. Baselines lose no messages.
     """
+    conditions = [
+        Condition(
+            scenario=SET_UPS[set_up].scenario(
+                duration_s=select.duration_s, loss=select.loss, payload=payload
+            )
+        )
+        for set_up in select.set_ups
+    ]
     study = Study(
         methods=(method,),
-        conditions=tuple(
-            Condition(
-                scenario=SET_UPS[set_up].scenario(
-                    duration_s=select.duration_s, loss=select.loss, payload=payload
-                )
-            )
-            for set_up in select.set_ups
-        ),
+        conditions=tuple(dict.fromkeys(conditions)),
         worlds=select.worlds,
         sizes_from=str(sizes_from.resolve()),
     )
     return [
         flight
-        for condition in study.conditions
+        for condition in conditions
         for draw in study.draws
         for flight in study.flights_of(method, condition, draw)
     ]

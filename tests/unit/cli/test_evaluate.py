@@ -1,4 +1,4 @@
-"""What cannot be evaluated."""
+"""What cannot be evaluated or studied."""
 
 import shutil
 from pathlib import Path
@@ -8,6 +8,7 @@ import pytest
 
 from edge.policy.bundle import BundleError
 from lpac.cli.evaluate import evaluate
+from lpac.cli.study import study
 from tests.conftest import SHIPPED
 
 
@@ -18,8 +19,8 @@ from tests.conftest import SHIPPED
         ({"baselines": ["cvt"]}, "--baseline cvt: must be one of decentralized-cvt, "),
         ({"set_ups": ["desert"]}, "--set-up desert: must be one of field, n1, "),
         ({"set_ups": ["field"], "transfer": True}, "--set-up does nothing beside it"),
-        ({"lost": ["2"]}, "lost robots '2': must be ROBOTS@SECONDS, such as 2@20"),
-        ({"lost": ["2@60"]}, "robots lost at 60 s: must be in flight"),
+        ({"lost": ["2"]}, "lost = '2': must be ROBOTS@SECONDS, such as 2@20"),
+        ({"lost": ["2@60"]}, "lost = 2@60: must be in flight"),
         ({"losses": [1.5]}, "loss = 1.5: must be from 0 to 1"),
         ({"transports": ["mesh"], "losses": [0.1]}, "--loss and --transport: the model itself"),
         ({"wifi": Path("wifi.toml")}, "--wifi does nothing without --transport"),
@@ -32,6 +33,14 @@ from tests.conftest import SHIPPED
 def test_options_that_cannot_be(options: dict[str, Any], text: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=text):
         evaluate(**options, out=tmp_path)
+
+
+def test_a_build_of_px4_that_nothing_flies(tmp_path: Path) -> None:
+    file = tmp_path / "points.toml"
+    file.write_text("worlds = 1\n")
+    with pytest.raises(ValueError, match=r"--px4 does nothing: no condition of .*points\.toml has"):
+        study(file=file, px4=tmp_path, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_bundles_that_cannot_fly(tmp_path: Path) -> None:

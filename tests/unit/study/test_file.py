@@ -99,14 +99,39 @@ def test_a_world_of_ones_own_and_paths_count_from_the_files_folder(tmp_path: Pat
         ("world_size = 640", 'set_up = "n4"', "scenario: set_up = 'n4': allowed are field, n1, "),
         ("decentralized-cvt-prior", "cvt", "baselines[0] = 'cvt': allowed are "),
         ("field = []", 'field = ["gone"]', "policies: "),
-        ("worlds = 3", "worlds = 0", "worlds = 0: must be at least 1"),
+        ("worlds = 3", "worlds = 0", "worlds = 0: must be from 1 to 10000"),
         ("worlds = 3", "world = 3", "unknown key 'world'; known are title, text, policies"),
         ('"curves"', '"curve"', "figures[0] = 'curve': allowed are 'curves', "),
-        ("wind_m_s", "lag_s", "lag_s = 5.0: must be 0.0 for whole robots"),
+        ("wind_m_s", "lag_s", "conditions[1]: lag_s = 5.0: must be 0.0 for whole robots"),
         ("clocks.policy_s", "clocks.jitter", "conditions[0]: clocks: jitter = 0.8: must be "),
-        ("wind_m_s = 5.0", 'lost = "2"', "conditions[1]: lost robots '2': must be ROBOTS@SECONDS"),
-        ("wind_m_s = 5.0", "robots = 31", "robots = 31: must be from 1 to 30"),
+        ("wind_m_s = 5.0", 'lost = "2"', "conditions[1]: lost = '2': must be ROBOTS@SECONDS"),
+        ("wind_m_s = 5.0", "robots = 31", "conditions[1]: robots = 31: must be from 1 to 30"),
         ("[[conditions]]", "[[conditions", "wind.toml: "),
+        ("[0.0, 0.3]", "[]", "conditions[0]: loss = []: must have a value"),
+        ("[0.0, 0.3]", "[[0.0, 0.3]]", "conditions[0]: loss = [0.0, 0.3]: "),
+        ("[0.0, 0.3]", "0.3\nmethods = []", "conditions[0]: methods = []: must be at least 1 long"),
+        ("[0.0, 0.3]", '0.3\nmethods = ["g"]', "conditions[0]: methods = 'g': must be one of "),
+        ("field = []", "clairvoyant-cvt = []", "policies: name = 'clairvoyant-cvt': must be an"),
+        ("field = []", '"" = []', "policies: name = '': must be 1 to 200 letters on one line"),
+        ("field = []", '"a\\nb|c" = []', "policies: name = 'a\\nb|c': must be "),
+        ("field = []", f"{'a' * 300} = []", "policies: name = 'aaa"),
+        ("wind_m_s = 5.0", 'title = "loss 0.3, clocks policy_s 0.8"', "[1]: title = 'loss 0.3, "),
+        ("wind_m_s = 5.0", 'title = "../mine"', "conditions[1]: title = '../mine': must be "),
+        ("wind_m_s = 5.0", 'lost = "2@9"', "conditions[1]: lost = 2@9: must not be given for whol"),
+        ("wind_m_s = 5.0", "from_pads = true", "conditions[1]: from_pads = True: must be False "),
+        ("wind_m_s = 5.0", 'fault = "landed"', "conditions[1]: fault = landed: no cost is judged"),
+        ("wind_m_s = 5.0", 'sensor = "eyes"', "conditions[1]: sensor"),
+        ("wind_m_s = 5.0", "robots = 2\nworld_size = 64", "conditions[1]: robots = 2: 1 fit on 4"),
+        ("wind_m_s = 5.0", 'world = "nix.env"', "conditions[1]: world = 'nix.env': "),
+        ('"simulated"', '"px4"', "conditions[1]: engine = 'px4': needs PX4's build folder"),
+        ("[0.0, 0.3]", '0.3\nlost = "2@20"', "conditions[0]: lost = 2@20: must be in flight"),
+        ("= 640", "= 7", "scenario: world_size = 7: must be from 64 to 8192"),
+        ("= 640", "= 70000000", "scenario: world_size = 70000000: must be from 64 to 8192"),
+        ("= 640", "= 640\nrobots = 1\nstarts_m = [[41, 0]]", "starts_m: [41.0, 0.0]: must be with"),
+        ("= 640", "= 640\nrandom_feature_count = 0", "scenario: random_feature_count = 0: must be"),
+        ('"curves"', '"repeatability"', "figures = 'repeatability': needs trials of at least 2"),
+        ('"curves"', '"perturbation"', "figures = 'perturbation': needs a policy, and failures"),
+        ("worlds = 3", "worlds = 100000000", "worlds = 100000000: must be from 1 to 10000"),
     ],
 )
 def test_a_mistake_is_one_line(tmp_path: Path, old: str, new: str, text: str) -> None:
@@ -114,6 +139,20 @@ def test_a_mistake_is_one_line(tmp_path: Path, old: str, new: str, text: str) ->
         read(tmp_path, (old, new))
     said = str(raised.value)
     assert text in said and "\n" not in said and said.startswith(f"{tmp_path / 'wind.toml'}: ")
+
+
+def test_what_a_title_stands_for_and_a_list_of_all_make_names(tmp_path: Path) -> None:
+    study = read(
+        tmp_path,
+        ("[scenario]", "[scenario]\ndelay_s = [0.0, 0.1]"),
+        ("clocks.policy_s = [0.4, 0.8]", 'title = "lossy"'),
+        ("wind_m_s = 5.0", "wind_m_s = 5.0\ndelay_s = 0.0"),
+    )
+    assert [condition.name for condition in study.conditions] == [
+        "lossy, delay_s 0, loss 0", "lossy, delay_s 0, loss 0.3",
+        "lossy, delay_s 0.1, loss 0", "lossy, delay_s 0.1, loss 0.3",
+        "delay_s 0, engine simulated, wind_m_s 5",
+    ]  # fmt: skip
 
 
 @given(st.floats().filter(lambda loss: not 0.0 <= loss <= 1.0))

@@ -124,9 +124,10 @@ def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"worlds": 0}, "worlds = 0: must be at least 1"),
+        ({"worlds": 0}, "worlds = 0: must be from 1 to 10000"),
         ({"world_set": "tests"}, "world_set = 'tests': allowed are 'training', 'validation'"),
         ({"methods": (ONE, ONE)}, "methods one, one, clairvoyant-cvt: each once"),
+        ({"conditions": (PLAIN, replace(PLAIN, title="field"))}, "title = 'field': must be ano"),
         ({"conditions": ()}, "conditions = .*: must be at least 1 long"),
         (
             {"conditions": (Condition(scenario=SET_UPS["n32"].scenario(), engine="simulated"),)},
@@ -134,7 +135,7 @@ def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:
         ),
         (
             {"conditions": (Condition(engine="simulated", lost=LostRobots(2, 20.0)),)},
-            "lost, from_pads: are of points alone",
+            "lost = 2@20: must not be given for whole robots",
         ),
         (
             {
@@ -158,10 +159,10 @@ def test_a_study_that_cannot_be(change: dict[str, object], text: str) -> None:
     ("change", "text"),
     [
         ({"scenario": Scenario()}, "world_size, communication_range: must be given"),
-        ({"lost": LostRobots(2, 60.0)}, "must be in flight"),
+        ({"lost": LostRobots(2, 60.0)}, "lost = 2@60: must be in flight, before 60 s"),
         (
             {"scenario": SET_UPS["n1"].scenario(), "lost": LostRobots(1, 20.0)},
-            "1 robots lost: must be fewer than 1",
+            "lost = 1@20: must be fewer than robots = 1",
         ),
     ],
 )

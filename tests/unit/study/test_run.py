@@ -87,5 +87,7 @@ def test_each_trial_in_each_world_is_told(tmp_path: Path) -> None:
 def test_a_method_needs_its_bundles() -> None:
     with pytest.raises(ValueError, match="baseline 'none': must be one of decentralized-cvt, "):
         Method.of("none")
+    with pytest.raises(ValueError, match="name = 'clairvoyant-cvt': must be another, since a base"):
+        Method.of("clairvoyant-cvt", SHIPPED)
     with pytest.raises(BundleError, match="nowhere"):
         Method.of("gone", Path("nowhere"))

@@ -58,9 +58,9 @@ def test_density_is_equal() -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"robots": 0}, "robots = 0: must be at least 1"),
+        ({"robots": 0}, "robots = 0: must be from 1 to "),
         ({"sigma": (2.0, 1.0)}, "sigma = "),
-        ({"communication_range": 0.0}, "communication_range = 0.0: must be positive"),
+        ({"communication_range": 0.0}, "communication_range = 0.0: must be above 0"),
     ],
 )
 def test_a_set_up_that_cannot_be(change: dict[str, object], text: str) -> None:
