@@ -13,6 +13,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from enum import StrEnum
+from numbers import Integral, Real
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import msgspec
@@ -196,6 +197,10 @@ def _is_bounded(hint: Any) -> bool:
     return bool(metas) or is_choice or any(map(_is_bounded, typing.get_args(kind)))
 
 
+# numpy's numbers too.
+_OF_TYPE: dict[Any, type] = {int: Integral, float: Real, str: str}
+
+
 class _Parsed(NamedTuple):
     """A field's type without None and constraints, its constraints, whether it may be None."""
 
@@ -244,6 +249,9 @@ def _fault(hint: Any, value: Any, where: str) -> str | None:
     kind, metas, optional = _parse(hint)
     if value is None and optional:
         return None
+    of_type = _OF_TYPE.get(kind)
+    if of_type is not None and not isinstance(value, of_type):
+        return where + _not_of(kind, value)
     for meta in metas:
         if not _holds(meta, value):
             return f"{where} = {_shown(value)}: must be {in_words(meta)}"

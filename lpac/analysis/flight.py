@@ -38,7 +38,7 @@ from edge.core.world import Feature
 from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState
 from lpac.analysis.coverage import Coverage
-from lpac.analysis.logs import LoggedStatus, LoopRates, simulated_name
+from lpac.analysis.logs import LoggedStatus, LoopRates
 from lpac.analysis.snapshot import FRESH_S
 from lpac.analysis.truth import TrueTrack
 
@@ -276,14 +276,14 @@ class FaultRecord:
 class FlightRecord:
     """One mission and its robots, from takeoff to landing; see above for what its numbers mean.
 
-    `begin_s` is Unix time, or 0; of a flight without a mission, when that began, and `duration_s`
-    is 0. `from_s` and `to_s` are what is shown. `robots` are the mission's. `truth` is where
-    vehicles were, by name: also others than the mission's, and beyond what is shown. Without a
-    world `coverage` is None, and the costs are empty. A robot's sensor sees `sensor_size` cells of
-    the world. `clocks_known`: the robots' clocks are corrected by what a ground heard. `rates` are
-    None if logs do not tell, and of robots that have not all the same. Simulators tell also the
-    id of the bundle, the world's `features`, and of points what became of messages, and the largest
-    number in one, by its absolute value.
+    Times count from the mission's begin, which was at Unix time `begin_s`, and lasted `duration_s`;
+    without a mission, from the flight's begin, and `duration_s` is 0. `from_s` and `to_s` are what
+    is shown. `robots` are the mission's. `truth` is where vehicles were, by name: also others than
+    the mission's, and beyond what is shown. Without a world `coverage` is None, and the costs are
+    empty. A robot's sensor sees `sensor_size` cells of the world. `clocks_known`: the robots'
+    clocks are corrected by what a ground heard. `rates` are None if logs do not tell, and of robots
+    that have not all the same. Simulators tell also the id of the bundle, the world's `features`,
+    and of points what became of messages, and the largest number in one, by its absolute value.
     """
 
     name: str
@@ -312,13 +312,16 @@ class FlightRecord:
 
     @property
     def time_s(self) -> F64:
-        """(T,): when points were sampled."""
+        """(T,): when points were sampled. Raises ValueError for other robots."""
+        if not self.robots or any(robot.said for robot in self.robots):
+            raise ValueError(f"{self.name}: has no points")
         return self.robots[0].time_s
 
     @property
     def positions_m(self) -> F64:
-        """(T, N, 2): where points were then. Raises ValueError for robots of times of their own."""
-        return np.stack([robot.position_m[:, :2] for robot in self.robots], axis=1)
+        """(T, N, 2): positions of points then, m. Raises ValueError for other robots."""
+        count = len(self.time_s)
+        return np.stack([robot.position_m[:count, :2] for robot in self.robots], axis=1)
 
     @property
     def flew_mission(self) -> bool:
@@ -327,14 +330,11 @@ class FlightRecord:
 
     @property
     def took_off(self) -> bool:
-        """Whether a robot of the script's was in the air."""
-        return any(map(self._took_off, range(len(self.script.programs))))
-
-    def _took_off(self, robot: int) -> bool:
-        track = self.truth.get(simulated_name(robot))
-        if track is not None and len(track.time_s):
-            return bool(track.airborne.any())
-        return any(change.state in AIRBORNE for change in self.script.programs[robot].changes)
+        """Whether a vehicle was in the air; without any track, whether a program says so."""
+        if any(len(track.time_s) for track in self.vehicles):
+            return any(track.airborne.any() for track in self.vehicles)
+        changes = (change for program in self.script.programs for change in program.changes)
+        return any(change.state in AIRBORNE for change in changes)
 
     @property
     def all_landed(self) -> bool:

@@ -318,7 +318,7 @@ class ScriptError(RuntimeError):
 class ScriptRun:
     """One run of a script. `robots` are those that it addresses, `given` whom a pilot has by it.
 
-    `mission_ends` may be set: the mission is over then, and the next step comes.
+    `mission_ends` may be set: the mission is over then, and the next step comes; nobody takes off.
 
     `fly` and `hold` are procedures: whoever has the ground carries them out.
     """
@@ -381,6 +381,8 @@ class ScriptRun:
     def _go(self, step: Step, where: str, count: str) -> Procedure[None]:
         name = f"{count}{_NAMES[type(step)]}"
         try:
+            if self.mission_ends and isinstance(step, TakeoffStep):
+                raise ScriptError("stopped", hold=False)
             if isinstance(step, MissionStep):
                 # Its time counts from when all fly it.
                 self._listener.step(f"{count}start", None)

@@ -8,6 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, Protocol
 
+from edge.core.logger import errors_only
+from edge.core.schema import require
 from edge.policy.bundle import Bundle, load_bundle, write_bundle
 from lpac.analysis.flight import FlightRecord
 from lpac.sim.batch import PolicyFailedError, fly_batch
@@ -56,8 +58,8 @@ class Engine(Protocol):
     ) -> list[FlightRecord]:
         """The record of each, in their order; whole robots' logs stay in `folder`, if there is one.
 
-        `watch` is called several times a second, and may stop the flight. A fleet's `script` says
-        in its record what kept it from its end.
+        `watch` is called several times a second, and may stop the flight; a fault's flight is not
+        watched. A fleet's `script` says in its record what kept it from its end.
 
         Raises BundleError; ValueError for what it cannot do, and for points that were stopped at
         their start; OSError, and in real time FleetError, LinkError, GroundError or VehicleError.
@@ -134,6 +136,7 @@ class ClockedRobots(_WholeRobots):
 
     def require_able(self, scenario: Scenario) -> None:
         """See `Engine`."""
+        scenario.require_default("robots on a simulated clock", "transport")
         require_whole_robots(scenario)
         _require_fault("simulated", scenario)
 
@@ -141,7 +144,8 @@ class ClockedRobots(_WholeRobots):
         self, scenario: Scenario, bundle: Path, folder: Path, watch: Watch | None, *, logs: bool
     ) -> FlightRecord:
         if scenario.fault:
-            return drill_of(str(bundle)).fly(scenario, folder if logs else None)
+            with errors_only():
+                return drill_of(str(bundle)).fly(scenario, folder if logs else None)
         return fly_simulated(
             scenario, folder, bundle, self.say, watch, logs=logs, recorded=self.recorded
         )
@@ -184,6 +188,7 @@ def engine_of(name: EngineName, px4_build: Path | None = None, say: Say = lambda
 
     Raises ValueError.
     """
+    require(EngineName, name, "engine")
     if name == "px4" and px4_build is None:
         raise ValueError("px4: needs PX4's build folder")
     if name == "point":
@@ -198,6 +203,8 @@ def flies(engine: EngineName, fault: Fault) -> bool:
 
 def _require_fault(engine: EngineName, scenario: Scenario) -> None:
     name = scenario.fault
+    if name and scenario.robots < 2:
+        raise ValueError(f"robots = {scenario.robots}: must be at least 2 for a fault")
     if name and name not in FAULTS:
         raise ValueError(f"fault = {name}: there is none; `lpac drill --list` has all")
     if name and not flies(engine, FAULTS[name]):
@@ -218,8 +225,11 @@ def fly(
 ) -> FlightRecord:
     """Fly one scenario on the engine of that name; `bundle` flies, or sizes a baseline's maps.
 
-    `folder` keeps what whole robots log. Raises what `engine_of` and `Engine.fly` do.
+    `folder` keeps what whole robots log. Raises what `engine_of` and `Engine.fly` do, and
+    ValueError for a watcher of a fault's flight, which has none.
     """
+    if scenario.fault and watch is not None:
+        raise ValueError(f"fault = {scenario.fault}: such a flight is not watched")
     chosen = engine_of(engine, px4_build, say)
     chosen.require_able(scenario)
     # Another bundle may be at that path by now.

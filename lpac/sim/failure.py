@@ -16,8 +16,9 @@ from edge.core.schema import Bounded, NonNegative
 class Failure(Bounded):
     """A robot is out of the swarm from `from_s` on until `until_s`; s since the start.
 
-    It stands still, hears and says nothing, and does not count for the cost. It comes back as a
-    restarted program does: with no explored map and no messages.
+    A point stands still, hears and says nothing, and does not count for the cost; it comes back as
+    a restarted program does: with no explored map and no messages. A whole robot is given to a
+    pilot, who flies it out of the fence and back.
 
     Raises ValueError that names what is impossible.
     """

@@ -15,8 +15,9 @@ from lpac.sim.usual import judgement, usual_whole
 
 
 def summary(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
-    """The flight as JSON-ready values; of points nothing depends on the machine's speed."""
+    """The flight as JSON-ready values."""
     told = {
+        "controller": scenario.controller,
         "bundle_id": record.bundle_id,
         "robots": scenario.robots,
         "seed": scenario.seed,
@@ -29,7 +30,6 @@ def summary(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
 def _of_points(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
     link, radio = scenario.link, scenario.radio
     return {
-        "controller": scenario.controller,
         "duration_s": record.duration_s,
         "scale": {
             "env_scale": scenario.scale.env_scale,
@@ -56,6 +56,8 @@ def _of_script(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
     return {
         "vehicle": script.vehicle,
         "errors": scenario.errors,
+        "wind_m_s": scenario.wind_m_s,
+        "link": {"loss": scenario.loss, "delay_s": scenario.delay_s},
         "problem": script.problem,
         "all_landed": record.all_landed,
         "commands": [

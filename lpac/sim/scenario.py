@@ -28,7 +28,7 @@ else:
 
 # The sensor's type that every installation has.
 WORLD_SENSOR = "world"
-Controller = Literal["lpac"] | BaselineName
+Controller = Literal["lpac", BaselineName]
 
 MAX_ROBOTS = MAX_ROBOT_ID + 1
 _INPUT_AGE_S = 1.0
@@ -38,11 +38,14 @@ class UnableError(ValueError):
     """An engine cannot do what a field of a scenario asks for."""
 
     def __init__(self, engine: str, name: str, value: object, default: object) -> None:
-        super().__init__(
-            f"{name} = {value}: must be {default or repr(default)} for {engine}, which know "
-            "nothing of it"
-        )
+        super().__init__(engine, name, value, default)
         self.name = name
+
+    def __str__(self) -> str:
+        engine, name, value, default = self.args
+        must = f"{name} = {value}: must be"
+        allowed = "left out" if default is None else default or repr(default)
+        return f"{must} {allowed} for {engine}, which know nothing of it"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +82,9 @@ class Scenario(Bounded):
     seed: Annotated[
         int, Meta(ge=0), "World, starts, clocks, losses and vehicles' errors follow from it."
     ] = 0
-    duration_s: Annotated[Positive, "Flight time, s; of whole robots that of the mission."] = 60.0
+    duration_s: Annotated[
+        float, Meta(gt=0.0, le=86_400.0), "Flight time, s; of whole robots that of the mission."
+    ] = 60.0
     features: Features | None = None
     random_feature_count: Annotated[int, Meta(ge=0), "Features of a random world."] = 10
     starts_m: tuple[tuple[Finite, Finite], ...] | None = None
@@ -119,7 +124,7 @@ class Scenario(Bounded):
         "Whole robots: with errors of positions, heights, compasses and batteries, and in wind.",
     ] = True
     wind_m_s: Annotated[
-        NonNegative | None,
+        Annotated[float, Meta(ge=0.0, le=30.0)] | None,
         "Whole robots: the mean wind, m/s, with gusts of up to 8 m/s; else it is drawn.",
     ] = None
     budget: ErrorBudget = ERRORS

@@ -48,10 +48,9 @@ def fly_simulated(
     OSError for a folder that cannot be written, RecordingError, and PartError if a policy or a
     sensor raises anything.
     """
-    scenario.require_default("robots on a simulated clock", "transport")
     # What ten robots say to their own logs is nothing for a person.
     with errors_only():
-        return _fly(scenario, Path(folder), Path(bundle), say, watch, logs, recorded)
+        return _fly(scenario, Path(folder).resolve(), Path(bundle), say, watch, logs, recorded)
 
 
 def _fly(

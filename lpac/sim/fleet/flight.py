@@ -37,7 +37,7 @@ from lpac.sim.sitl.ground_station import RealVehicles
 class FleetMoment:
     """A fleet at one time, s from the script's start; `statuses` are by robot.
 
-    `stop` ends the mission: all return, and land.
+    `stop` ends the mission: all return, and land. Before the takeoff it ends the script.
     """
 
     time_s: float

@@ -98,6 +98,12 @@ class Layout:
         training = manifest.training
         self.scenario = scenario
         self.field_m = perception.world_size / FIELD_SCALE.env_scale
+        for i, place_m in enumerate(scenario.starts_m or ()):
+            if not all(0.0 <= metres <= self.field_m for metres in place_m):
+                raise ValueError(
+                    f"starts_m[{i}] = {list(place_m)}: must be in the world, from 0 to "
+                    f"{self.field_m:g} m"
+                )
         self.max_speed_m_s = training.max_speed * FIELD_SCALE.velocity_scale
         self.to_mission: LocalTransform = ORIGIN.frame().relative_to(
             WORLD.latitude_deg, WORLD.longitude_deg

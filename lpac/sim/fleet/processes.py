@@ -176,7 +176,6 @@ class Fleet:
         Raises ValueError if that one is no build, or there is no room for so many robots;
         BundleError for a bundle that cannot be loaded, or has no perception.
         """
-        scenario.require_default("programs in real time", "loss", "delay_s")
         self.layout = Layout(scenario, bundle_path, without_vehicles=px4_build is not None)
         self.folder = folder.resolve()
         self.fleet_toml = self.folder / "fleet.toml"

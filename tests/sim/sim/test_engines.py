@@ -44,20 +44,27 @@ def test_a_fault_is_a_part_of_a_scenario(tmp_path: Path) -> None:
     least = record.true_separation
     assert least is not None and least.distance_m > record.fault.drone_m
     assert record.fault.hit and record.fault.begin_s > 0.0
+    assert record.took_off and record.all_landed
+    with pytest.raises(ValueError, match="has no points"):
+        assert record.positions_m is None
     assert not any(figure.broken for figure in judge(fault.judged_by, record))
     assert list(tmp_path.rglob("*.mcap"))
 
 
-@pytest.mark.parametrize(
-    ("engine", "fault", "said"),
-    [
-        ("point", "landed", "fault = landed: must be '' for points"),
-        ("simulated", "nothing-such", "fault = nothing-such: there is none; `lpac drill --list`"),
-        ("mavlink", "radio-dies", "fault = radio-dies: is not flown with mavlink"),
-    ],
-)
-def test_an_engine_says_what_fault_it_does_not_fly(
-    engine: EngineName, fault: str, said: str
+def test_a_fleet_is_stopped_before_it_takes_off() -> None:
+    scenario = Scenario(robots=2, seed=3, duration_s=3.0, errors=False, budget=PRECISE)
+    flown = fly(scenario, SHIPPED, lambda moment: moment.stop(), engine="simulated")
+    assert not (flown.took_off or flown.flew_mission)
+    assert flown.script.problem is not None and flown.script.problem.endswith("stopped")
+    with pytest.raises(ValueError, match="fault = landed: such a flight is not watched"):
+        fly(scenario_of(FAULTS["landed"], 0, 2), SHIPPED, print, engine="simulated")
+
+
+def test_logs_are_found_in_a_folder_named_from_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ValueError, match=said):
-        fly(Scenario(fault=fault), SHIPPED, engine=engine)
+    monkeypatch.chdir(tmp_path)
+    scenario = Scenario(robots=1, seed=3, duration_s=1.0, errors=False, budget=PRECISE)
+    flown = fly(scenario, SHIPPED, engine="simulated", folder=Path("out/here"))
+    [program] = flown.script.programs
+    assert [Path("out/here", log).exists() for log in program.logs] == [True]

@@ -255,7 +255,7 @@ def test_what_the_swarm_does_depends_on_its_messages(shipped_bundle: Bundle) -> 
     ("change", "text"),
     [
         ({"robots": 0}, "robots = 0: must be from 1 to"),
-        ({"duration_s": -1.0}, "duration_s = -1.0: must be above 0 and finite"),
+        ({"duration_s": -1.0}, "duration_s = -1.0: must be above 0 and at most 86400"),
         ({"random_feature_count": -1}, "random_feature_count = -1: must be at least 0"),
         ({"loss": 1.5}, "loss = 1.5: must be from 0 to 1"),
         ({"delay_s": -0.1}, "delay_s = -0.1"),

@@ -1,5 +1,6 @@
 """Each engine refuses what it cannot do."""
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -7,12 +8,11 @@ import pytest
 
 from edge.core.frames import ModelScale
 from edge.policy.bundle import load_bundle
+from lpac.sim.engines import EngineName, fly
 from lpac.sim.failure import Failure
-from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.layout import Layout
-from lpac.sim.fleet.processes import Fleet
 from lpac.sim.points import prepare
-from lpac.sim.scenario import Scenario
+from lpac.sim.scenario import Scenario, UnableError
 from lpac.sim.ticks import Clocks
 from tests.conftest import SHIPPED
 
@@ -36,7 +36,7 @@ def test_points_have_no_vehicles_sensors_or_keys(field: str, asked: Any, named: 
     [
         (Scenario(controller="shared-cvt"), "controller = shared-cvt: must be lpac for whole rob"),
         (Scenario(scale=ModelScale(1.0, 1.0)), "scale = "),
-        (Scenario(max_speed_m_s=2.0), "max_speed_m_s = 2.0: must be None for whole robots"),
+        (Scenario(max_speed_m_s=2.0), "max_speed_m_s = 2.0: must be left out for whole robots"),
         (Scenario(robots=1, position_bias=((1.0, 1.0),)), "position_bias = "),
         (Scenario(lag_s=0.5), "lag_s = 0.5: must be 0.0 for whole robots"),
         (Scenario(payload="int8"), "payload = int8: must be float16 for whole robots"),
@@ -50,11 +50,44 @@ def test_whole_robots_fly_as_they_do_in_the_field(scenario: Scenario, named: str
         Layout(scenario, SHIPPED)
 
 
-def test_a_radio_is_simulated_or_real(tmp_path: Path) -> None:
-    with pytest.raises(
-        ValueError, match=r"^transport = multicast: must be mesh for robots on a sim"
-    ):
-        fly_simulated(Scenario(transport="multicast"), tmp_path, SHIPPED)
-    with pytest.raises(ValueError, match=r"^loss = 0.1: must be 0.0 for programs in real time"):
-        Fleet(Scenario(loss=0.1), tmp_path, SHIPPED)
+@pytest.mark.parametrize(
+    ("engine", "scenario", "said"),
+    [
+        ("simulated", Scenario(transport="multicast"), "transport = multicast: must be mesh"),
+        ("mavlink", Scenario(loss=0.1), "loss = 0.1: must be 0.0 for programs in real time"),
+        ("point", Scenario(wind_m_s=3.0), "wind_m_s = 3.0: must be left out for points"),
+        ("simulated", Scenario(fault="landed", robots=1), "robots = 1: must be at least 2"),
+        ("point", Scenario(fault="landed"), "fault = landed: must be '' for points"),
+        ("simulated", Scenario(fault="nothing"), "fault = nothing: there is none"),
+        ("mavlink", Scenario(fault="radio-dies"), "fault = radio-dies: is not flown with mavlink"),
+        ("nonsense", Scenario(), "engine = 'nonsense': allowed are 'point', 'simulated'"),
+        ("px4", Scenario(), "px4: needs PX4's build folder"),
+    ],
+)
+def test_an_engine_says_what_it_cannot_do(
+    engine: EngineName, scenario: Scenario, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=f"^{said}"):
+        fly(scenario, SHIPPED, engine=engine, folder=tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_an_engine_cannot_do_comes_from_another_process() -> None:
+    error = UnableError("points", "wind_m_s", 3.0, None)
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.name) == (str(error), "wind_m_s")
+    assert str(error).startswith("wind_m_s = 3.0: must be left out for points")
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"controller": "cvt"}, "controller = 'cvt': allowed are 'lpac', "),
+        ({"robots": "3"}, "robots = '3': expected int"),
+        ({"duration_s": 1e12}, "duration_s = 1000000000000.0: must be above 0 and at most 86400"),
+        ({"wind_m_s": 300.0}, "wind_m_s = 300.0: must be from 0 to 30"),
+    ],
+)
+def test_a_scenario_that_cannot_be(values: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=f"^{said}"):
+        Scenario(**values)

@@ -90,7 +90,7 @@ def test_a_world_of_ones_own_and_paths_count_from_the_files_folder(tmp_path: Pat
     ("old", "new", "text"),
     [
         ("[0.0, 0.3]", "[0.0, 3.0]", "conditions[0]: loss = 3.0: must be from 0 to 1"),
-        ("= 5.0", "= -5.0", "conditions[1]: wind_m_s = -5.0: must be at least 0 and finite"),
+        ("= 5.0", "= -5.0", "conditions[1]: wind_m_s = -5.0: must be from 0 to 30"),
         ('"simulated"', '"gazebo"', "conditions[1]: engine = 'gazebo': allowed are 'point', "),
         ("world_size", "world_sise", "scenario: unknown key 'world_sise'; known are title, engine"),
         ("= 640", "= 0", "scenario: world_size = 0: must be at least 1"),
