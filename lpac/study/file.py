@@ -75,7 +75,7 @@ class StudyFile(Bounded):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ConditionKeys:
+class ConditionKeys(Bounded):
     """Keys of a condition that are none of its scenario's."""
 
     title: Annotated[str, "Its name in figures and tables; else what is otherwise."] = ""
@@ -89,8 +89,8 @@ class ConditionKeys:
     ] = False
     lost: Annotated[str, "Points lost in flight, ROBOTS@SECONDS, such as 2@20."] = ""
     methods: Annotated[
-        tuple[str, ...], Meta(min_length=1), "Names of those that fly it; else all."
-    ] = ()
+        tuple[str, ...] | None, Meta(min_length=1), "Names of those that fly it; else all."
+    ] = None
     set_up: Annotated[
         str, "Team and world, from which other keys differ: field, n32, paper, ..."
     ] = "field"
@@ -178,7 +178,7 @@ def condition_of(keys: Mapping[str, object], where: str, folder: Path = Path()) 
             engine=own.engine,
             from_pads=own.from_pads,
             lost=LostRobots.parse(own.lost) if own.lost else NONE_LOST,
-            methods=own.methods,
+            methods=own.methods or (),
             title=own.title,
         )
     except ValueError as error:
