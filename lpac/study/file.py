@@ -89,7 +89,8 @@ class ConditionKeys(Bounded):
     ] = False
     lost: Annotated[str, "Points lost in flight, ROBOTS@SECONDS, such as 2@20."] = ""
     methods: Annotated[
-        tuple[str, ...] | None, Meta(min_length=1), "Names of those that fly it; else all."
+        Annotated[tuple[str, ...], Meta(min_length=1)] | None,
+        "Names of those that fly it; else all.",
     ] = None
     set_up: Annotated[
         str, "Team and world, from which other keys differ: field, n32, paper, ..."
