@@ -400,7 +400,8 @@ def _extrapolated(neighbour: Neighbour) -> Vector:
 
 
 def _is_known(neighbour: Neighbour) -> bool:
-    return _plausible((*neighbour.position_m, *neighbour.velocity_m_s, neighbour.age_s))
+    """Whether its numbers are plausible: NaN and infinity are not."""
+    return math.hypot(*neighbour.position_m, *neighbour.velocity_m_s, neighbour.age_s) < _ABSURD
 
 
 def _caps_at_edges(

@@ -384,11 +384,9 @@ class FlightControl:
             if beacon.state is FlightState.PILOT or _is_off_height(beacon)
         }
         return tuple(
-            each
-            if each.shared is None and each.robot_id not in piloted
             # Flight has no use for their maps, and the log would hold each of them at each tick.
-            else each._replace(shared=None, is_piloted=each.robot_id in piloted)
-            for each in (*heard, *told)
+            Neighbour(robot_id, place_m, velocity_m_s, age_s, trial, None, robot_id in piloted)
+            for robot_id, place_m, velocity_m_s, age_s, trial, _, _ in (*heard, *told)
         )
 
     def _revoked_places(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:

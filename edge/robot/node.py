@@ -306,14 +306,12 @@ class RobotNode:
         control = self._control
         self._look_for_world()
         assignment = control.assignment
-        is_due = self._checks_are_due(self._ports.clock.monotonic_s())
-        if is_due:
-            self.readiness.prepare(
-                self._ports.clock.monotonic_s(), assignment, steers=control.flight.state in _STEERS
-            )
-            control.px4_change = self.readiness.px4_change
-        if not is_due:
+        if not self._checks_are_due(self._ports.clock.monotonic_s()):
             return
+        self.readiness.prepare(
+            self._ports.clock.monotonic_s(), assignment, steers=control.flight.state in _STEERS
+        )
+        control.px4_change = self.readiness.px4_change
         now_s = self._ports.clock.monotonic_s()
         peers = self._inbox.peers(now_s)
         # A robot's own wall clock may be wrong: there is no internet on a field.

@@ -7,6 +7,7 @@ and a limit: no answer ever leads to more than the one next message.
 
 import math
 from collections.abc import Mapping
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 from edge.core.logger import log
@@ -266,8 +267,8 @@ class Dialogue:
                 self._unanswered[request] = 0
                 self._due_s[request] = now_s + request.period_s
         self._plan(now_s, vehicle)
-        due = min(self._due_s, key=self._due_s.__getitem__)
-        at_s = max(self._due_s[due], self._apart_until_s)
+        due, due_s = min(self._due_s.items(), key=itemgetter(1))
+        at_s = max(due_s, self._apart_until_s)
         if now_s < at_s:
             self.next_s = min(self.next_s, at_s)
             return

@@ -487,6 +487,8 @@ class Px4Events:
 
     def told(self, since_s: float) -> tuple[AutopilotReason, ...]:
         """Warnings of PX4 since then that are told once, the newest first."""
+        if not self._told or self._told[-1].at_s < since_s:
+            return ()
         recent = takewhile(lambda told: told.at_s >= since_s, reversed(self._told))
         return _reasons(recent)
 

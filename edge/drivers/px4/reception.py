@@ -119,6 +119,8 @@ class VehicleFrames:
         # dict that is emptied from its front takes ever longer to find that.
         self._taken: OrderedDict[Hashable, tuple[float, Hashable, _Stream | None]] = OrderedDict()
         self._seconds: deque[_Second] = deque(maxlen=_LOSS_S + 1)
+        # When a frame was last found to be lost, and last came again.
+        self._lost_at_s = self._again_at_s = -math.inf
 
     def take(self, frame: Frame, now_s: float) -> bool:
         """Whether it is to be taken: it is neither old nor was taken before."""
@@ -137,7 +139,9 @@ class VehicleFrames:
         sort, stream = self._sort(frame, path, now_s)
         path.heard_at_s = now_s
         second = self._this(now_s)
-        second.again += sort == "again"
+        if sort == "again":
+            second.again += 1
+            self._again_at_s = now_s
         if frame.vehicle_s is None:
             is_old = self._is_late(path) or (stream is not None and stream.is_late)
         else:
@@ -151,8 +155,9 @@ class VehicleFrames:
         if is_old or sort != "next":
             return False
         second.taken += 1
+        if frame.content in self._taken:
+            self._taken.move_to_end(frame.content)
         self._taken[frame.content] = now_s, frame.path, stream
-        self._taken.move_to_end(frame.content)
         if frame.vehicle_s is not None:
             second.timed += 1
             self._newest[frame.message_id] = _Newest(frame.vehicle_s, now_s, frame.path)
@@ -165,12 +170,16 @@ class VehicleFrames:
 
     def lost(self, now_s: float) -> float:
         """The share of the frames that were lost in the last ten seconds, in steps of 5 %."""
+        if now_s - self._lost_at_s > _LOSS_S + 1:
+            return 0.0
         seconds = self._within(_LOSS_S, now_s)
         taken, lost = sum([s.taken for s in seconds]), sum([s.lost for s in seconds])
         return round(20.0 * lost / (taken + lost)) / 20.0 if taken + lost >= _LEAST_FRAMES else 0.0
 
     def arrives_twice(self, now_s: float) -> bool:
         """Whether frames come again that were taken before."""
+        if now_s - self._again_at_s > _OTHERS_S + 1:
+            return False
         return sum([s.again for s in self._within(_OTHERS_S, now_s)]) >= _LEAST_TWICE
 
     def has_others(self, now_s: float) -> bool:
@@ -252,6 +261,7 @@ class VehicleFrames:
             stream.missing |= {(frame.number - n) % _NUMBERS for n in range(1, ahead)}
             if self.path in (None, frame.path) and not stream.is_late:
                 self._this(now_s).lost += ahead - 1
+                self._lost_at_s = now_s
 
     def _this(self, now_s: float) -> _Second:
         second = math.floor(now_s)

@@ -8,7 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core.ports import Clock
-from edge.core.vehicle import Action, Setpoint, VehicleState, Velocity
+from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velocity
 from edge.drivers.px4.dialogue import Dialogue
 from edge.drivers.px4.reception import Frame, VehicleFrames
 from edge.drivers.px4.telemetry import Px4Telemetry
@@ -44,8 +44,9 @@ class DirectVehicle:
         self._uploaded: tuple[FencePolygon, ...] = ()
         self._dialogue = Dialogue(self._telemetry)
         self._frames = VehicleFrames()
-        # Time and state of the last answer: a robot asks several times a tick. Messages clear it.
-        self._told: tuple[float, VehicleState] | None = None
+        # Last answer, when, and with what came of commands: a robot asks several times a tick.
+        # Messages clear it.
+        self._told: tuple[float, ActionResult | None, VehicleState] | None = None
         # Nobody else listens on this link: what the robot does not read costs time alone.
         self._link.silence(self._telemetry.messages)
 
@@ -66,10 +67,14 @@ class DirectVehicle:
 
     def state(self) -> VehicleState:
         """The newest of everything."""
-        now_s = self._clock.monotonic_s()
-        if self._told is None or self._told[0] != now_s:
-            self._told = now_s, self._state(now_s)
-        return self._told[1]
+        now_s, result = self._clock.monotonic_s(), self._dialogue.result
+        if self._told is None or self._told[:2] != (now_s, result):
+            state = self._telemetry.state(
+                now_s, system_id=self._system_id, result=result,
+                link_lost=self._frames.lost(now_s), link_twice=self._frames.arrives_twice(now_s),
+            )  # fmt: skip
+            self._told = now_s, result, state
+        return self._told[2]
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
         """Send it once."""
@@ -110,15 +115,8 @@ class DirectVehicle:
 
     # What it sends
 
-    def _state(self, now_s: float) -> VehicleState:
-        return self._telemetry.state(
-            now_s, system_id=self._system_id, result=self._dialogue.result,
-            link_lost=self._frames.lost(now_s), link_twice=self._frames.arrives_twice(now_s),
-        )  # fmt: skip
-
     def _say(self, now_s: float) -> None:
-        self._told = None
-        for name, fields in self._dialogue.say(now_s, self._state(now_s)):
+        for name, fields in self._dialogue.say(now_s, self.state()):
             if name == "REQUEST_EVENT":
                 self._send(request_event(**fields))
             elif name == "PARAM_SET":

@@ -64,7 +64,8 @@ class Wave(NamedTuple):
 
     def at(self, time_s: float) -> float:
         """How far it has walked since time 0."""
-        return self.amplitude * (math.sin(self.rate_rad_s * time_s + self.phase_rad) - self.began)
+        amplitude, rate_rad_s, phase_rad, began = self
+        return amplitude * (math.sin(rate_rad_s * time_s + phase_rad) - began)
 
     def about(self, time_s: float) -> float:
         """How far it is from its middle."""

@@ -29,9 +29,13 @@ class Failsafe:
 
     def reset(self) -> None:
         """The vehicle was armed or disarmed."""
+        self.end()
+        self._taken_over = False
+
+    def end(self) -> None:
+        """Do nothing, since nothing is wrong."""
         self.action = FailsafeAction.NONE
         self._wanted = {}
-        self._taken_over = False
 
     def take_over(self) -> bool:
         """Somebody asks for a mode; whether that ends a failsafe which was active."""
@@ -48,14 +52,11 @@ class Failsafe:
         intended_mode: Px4Mode,
         position_valid: bool,
     ) -> FailsafeCause:
-        """Set `action`; returns whose it is, any cause if there is none.
+        """Set `action`; returns whose it is.
 
-        `wanted` is what each cause calls for. `delay_s` is COM_FAIL_ACT_T: for so long the vehicle
-        holds, for somebody to take it over.
+        `wanted` is what each cause calls for; call `end` instead if none calls for anything.
+        `delay_s` is COM_FAIL_ACT_T: for so long the vehicle holds, for somebody to take it over.
         """
-        if not any(wanted.values()):
-            self._wanted, self.action = {}, FailsafeAction.NONE
-            return next(iter(wanted))
         for cause, action in wanted.items():
             if action >= FailsafeAction.HOLD > self._wanted.get(cause, FailsafeAction.NONE):
                 self._taken_over = False

@@ -151,7 +151,6 @@ _ACTIONS = {
     FailsafeAction.DESCEND: 8,
     FailsafeAction.STOP_MOTORS: 10,
 }
-_ALL_CAUSES = tuple(FailsafeCause)
 # A member of an enum takes ten times as long to look up; this one, 400 times a second.
 _NONE = FailsafeAction.NONE
 _CAUSES = {FailsafeCause.MANUAL_CONTROL_LOST: 1, FailsafeCause.GROUND_STATION_LOST: 2}
@@ -686,10 +685,8 @@ class Px4Vehicle:
                 checks.GROUND_STATION_REQUIRED if required else checks.NO_GROUND_STATION,
             ),
         )
-        problems: tuple[ArmingProblem, ...] = tuple(
-            p for is_so, p in found if is_so and p is not None
-        )
-        return HealthReport(problems, frozenset(is_there))
+        problems: list[ArmingProblem] = [p for is_so, p in found if is_so and p is not None]
+        return HealthReport(tuple(problems), frozenset(is_there))
 
     # Modes
 
@@ -719,7 +716,11 @@ class Px4Vehicle:
             self._on_ground_station_loss(), self._on_battery(), self._on_silent_battery(),
             self._on_geofence(), self._on_position_loss(),
         )  # fmt: skip
-        causes = dict(zip(_ALL_CAUSES, wanted, strict=True))
+        if not any(wanted):
+            self.failsafe.end()
+            self._enter(self.intended_mode)
+            return
+        causes = dict(zip(FailsafeCause, wanted, strict=True))
         before = self.failsafe.action
         cause = self.failsafe.decide(
             causes,
@@ -1076,7 +1077,7 @@ class Px4Vehicle:
             return None
         if not math.isnan(self._setpoint.position_m[0]):
             return "position"
-        return "velocity" if self._setpoint.velocity_m_s[:2].any() else "stop"
+        return "velocity" if any(self._setpoint.velocity_m_s[:2].tolist()) else "stop"
 
 
 def _axis(velocity_m_s: float, error_m: float, gain: float, drift_m_s: float) -> float:
