@@ -79,15 +79,19 @@ def new_table(*, narrow: bool, heading: bool = True) -> "Table":
 def lines_of(how_far: Callable[[], str]) -> Iterator[None]:
     """A line on stderr every `LINE_EVERY_S`, as long as this context lasts.
 
-    For where there is no terminal. `how_far` is called in another thread.
+    For where there is no terminal, and once more in the end if it says something else than the
+    last. `how_far` is called in another thread.
     """
     ended = threading.Event()
+    last = ""
 
     def tell() -> None:
+        nonlocal last
         # A pipe that nobody reads any more does not end the work.
         with suppress(OSError):
             while not ended.wait(LINE_EVERY_S):
-                typer.echo(how_far(), err=True)
+                last = how_far()
+                typer.echo(last, err=True)
 
     thread = threading.Thread(target=tell, daemon=True)
     thread.start()
@@ -96,6 +100,9 @@ def lines_of(how_far: Callable[[], str]) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+    if last and how_far() != last:
+        with suppress(OSError):
+            typer.echo(how_far(), err=True)
 
 
 class LiveView:

@@ -92,15 +92,18 @@ def pairs(condition: Condition, results: Sequence[MethodResult]) -> Figure:
         for axes, rival in zip(panels, rivals, strict=False):
             axes.plot((low, high), (low, high), color=style.FAINT, lw=0.8, zorder=0)
             for policy in policies:
-                for training in policy.final:
+                for number, training in enumerate(policy.final):
                     axes.plot(
                         rival.final.mean(axis=0), training, ls="", marker="o", ms=2.5,
                         color=looks[id(policy)], alpha=0.7, mew=0,
+                        label=policy.method.name if number == 0 else None,
                     )  # fmt: skip
             axes.set(xlabel=rival.method.name, xscale="log", yscale="log")
             axes.set(xlim=(low, high), ylim=(low, high), aspect="equal")
             _plain_ticks(axes)
-        panels[0].set_ylabel(" / ".join(policy.method.name for policy in policies), fontsize=7)
+        panels[0].set_ylabel("policy" if len(policies) == 1 else "policies", fontsize=7)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=7)
         figure.suptitle(
             f"{condition.name}: $J$ at the end $/\\,J(0)$, a dot per world; below the line the "
             "policy is better", fontsize=8,

@@ -27,5 +27,10 @@ def made_by_study(command: str, study: Study) -> dict[str, str]:
     """The same of a study's bundles and worlds."""
     ids = [each.bundle_id for method in study.methods for each in method.trainings]
     first, last = study.draws[0].world, study.draws[-1].world
+    policies = [
+        f"{method.name}: {each.path}, {each.bundle_id[:12]}"
+        for method in study.methods
+        for each in method.trainings
+    ]
     worlds = f"{first} to {last} of the {study.world_set} set, and their seeds"
-    return made_by(command, ids, {"worlds": worlds})
+    return made_by(command, ids, {"policies": "; ".join(policies), "worlds": worlds})

@@ -32,6 +32,7 @@ class Report:
 
     The `legend` explains all tables. `told` is for scripts, `rows` are the CSV's, its heading
     first. `flown` says how it was flown, `made_by` what made it: command, policies, versions.
+    `beside` says, in Markdown, what else is in the folder.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Report:
     figures: Sequence[Picture]
     flown: str
     legend: str = ""
+    beside: str = ""
     made_by: Mapping[str, str]
 
     @property

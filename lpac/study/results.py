@@ -147,6 +147,7 @@ def conditions_json(
         {
             "name": condition.name,
             "set_up": condition.set_up,
+            "sizes": condition.sizes,
             "engine": condition.engine,
             "from_pads": condition.from_pads,
             "lost_robots": condition.lost.robots,

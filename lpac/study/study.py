@@ -154,12 +154,16 @@ class Condition:
     def set_up(self) -> str:
         """By its name; or its sizes, if it has none."""
         own = SetUp.of(self.scenario)
-        for name, known in SET_UPS.items():
-            if known == own:
-                return name
+        return next((name for name, known in SET_UPS.items() if known == own), self.sizes)
+
+    @property
+    def sizes(self) -> str:
+        """In words."""
+        own, features = SetUp.of(self.scenario), self.scenario.features
+        count = own.features if features is None else len(features)
         return (
-            f"{own.robots} robots in {own.world_size} x {own.world_size} units, {own.features} "
-            f"features, range {own.communication_range:g}"
+            f"{counted(own.robots, 'robot')} in {own.world_size} x {own.world_size} units, "
+            f"{counted(count, 'feature')}, range {own.communication_range:g}"
         )
 
     def _differences(self) -> Iterator[str]:

@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import edge
+import lpac
 from edge.core.counted import counted
 from edge.policy.bundle import load_bundle
 from lpac.analysis import style
@@ -13,6 +15,7 @@ from lpac.analysis.statistics import VERDICT_RULE, Interval95, what_would_tell
 from lpac.radio.airtime import LinkQuality
 from lpac.sim.cores import Pool
 from lpac.sim.engines import EngineName
+from lpac.sim.kept import KeptOutcomes, code_digest
 from lpac.study import figures, rates
 from lpac.study.flights import CLAIRVOYANT, PlannedFlight, fly_all, records_of
 from lpac.study.hearing_robot import message_bytes
@@ -27,6 +30,8 @@ from lpac.study.study import USUAL_FIGURES, Condition, Draw, Figure, Study
 WHOLE_ROBOTS = "whole robots"
 # Of each policy, under the first condition.
 _WORST = 10
+# Which pictures there are, and of which flights.
+_DRAWN = "drawn.jsonl"
 _FLOWN: dict[EngineName, str] = {
     "point": "Points fly what the policies decide: without takeoff, landing, heights and wind.",
     "simulated": "Whole robots fly, with their programs' loops and separation, on simulated PX4s "
@@ -36,8 +41,10 @@ _FLOWN: dict[EngineName, str] = {
     "software.",
 }
 _WHOLE = (
-    "Their costs are those of the vehicles' true positions. Baselines fly as points, from the same "
-    "pads and with the same receivers' errors."
+    "Costs of whole robots are those of their vehicles' true positions. Curves may begin above 1: "
+    "until the mission begins, whole robots drift from their pads, and costs are over the least "
+    "that any method begins with. Baselines fly as points, from the same pads and with the same "
+    "receivers' errors."
 )
 _COLUMNS = (
     "", "mean\nJ / J(0)", "95 %", "p90", "worst", "area", "vs\nclair-\nvoyant", "p90",
@@ -79,7 +86,7 @@ def _tables(told: Mapping[str, Any], condition: Mapping[str, Any]) -> Iterator[T
         over = "all missions of such a team"
     elif told["trials_per_world"] > 1:
         over = f"{over}, {told['trials_per_world']} trials in each"
-    note = []
+    note = [] if told["world_set"] is None else [_flown(condition)]
     if condition["scenario"]["radio"] is not None:
         note.append(LinkQuality(**condition["scenario"]["link"]).in_words)
     note += [
@@ -104,6 +111,12 @@ def _tables(told: Mapping[str, Any], condition: Mapping[str, Any]) -> Iterator[T
         ]
         headings = ("against", *(policy["name"] for policy in policies))
         yield Table(headings, rows)
+
+
+def _flown(condition: Mapping[str, Any]) -> str:
+    """The sizes and the engine."""
+    duration_s, engine = condition["scenario"]["duration_s"], condition["engine"]
+    return f"{condition['sizes']}, {duration_s:g} s, engine {engine}"
 
 
 def _row(result: Mapping[str, Any]) -> list[str]:
@@ -175,11 +188,13 @@ def report_of(
     for section in sections:
         told |= section.told
     # That of the rates has all conditions in it.
-    of_conditions = [] if "rates" in study.figures else tables_of(told)
+    of_conditions, text = tables_of(told), study.text
+    if "rates" in study.figures:
+        of_conditions, text = [], f"{text} First condition: {_flown(told['conditions'][0])}."
     return Report(
         name=name,
         title=study.title or name,
-        text=f"{study.text} {flown_as(study)}".strip(),
+        text=f"{text} {flown_as(study)}".strip(),
         legend=LEGEND if of_conditions else "",
         told={**told, **further},
         rows=next((section.rows for section in sections), rows_of(told)),
@@ -187,7 +202,21 @@ def report_of(
         figures=[picture for its in sections for picture in its.figures]
         + draw_conditions(flown.results, folder, study.figures),
         flown=flown_as(study),
+        beside=_worst_in_words(study) if "worst" in study.figures else "",
         made_by=made_by,
+    )
+
+
+def _worst_in_words(study: Study) -> str:
+    """Nothing if no policy flies under the first condition."""
+    condition = study.conditions[0]
+    policies = [method.name for method in study.methods_of(condition) if method.trained]
+    if not policies:
+        return ""
+    return (
+        f"[`worst`](worst) has pictures of the worst worlds, at most {_WORST}, of "
+        f"{' and '.join(policies)} under the first condition, {condition.name}: highest over "
+        "clairvoyant first."
     )
 
 
@@ -292,7 +321,10 @@ def draw_worst(
     pool: Pool,
     tell: Tell = lambda *_: None,
 ) -> None:
-    """The worst worlds of each policy under the first condition, flown again. Raises OSError."""
+    """The worst worlds of each policy under the first condition, flown again. Raises OSError.
+
+    Pictures that are there of the same flights stay.
+    """
     condition, of_all = next(iter(results.items()))
     clairvoyant = next(r.method for r in of_all if r.method.name == CLAIRVOYANT)
     wanted = {
@@ -304,14 +336,21 @@ def draw_worst(
         if result.method.trained
         for place, index in enumerate(worst_worlds(result, _WORST), 1)
     }
-    flights = list(dict.fromkeys(flight for pair in wanted.values() for flight in pair))
+    drawn = KeptOutcomes(folder / "worst" / _DRAWN, {"code": code_digest(edge, lpac)})
+    missing = []
+    for (name, place, world), pair in wanted.items():
+        path = folder / "worst" / name.replace("/", "-") / f"{place:02d}-world-{world}"
+        line = {"picture": str(path.relative_to(folder)), "of": [flight.key for flight in pair]}
+        newest = [its for its in drawn.lines if its["picture"] == line["picture"]][-1:]
+        if newest != [line] or not path.with_suffix(".png").exists():
+            missing.append((name, path, line, pair))
+    flights = list(dict.fromkeys(flight for *_, pair in missing for flight in pair))
     flown: dict[PlannedFlight, FlightRecord] = {}
-    of = len(flights) + len(wanted)
+    of = len(flights) + len(missing)
     for flight, record in fly_all(records_of, flights, pool):
         flown[flight] = record
         tell(len(flown), of)
-    for done, ((name, place, world), pair) in enumerate(wanted.items(), 1):
-        shown: dict[str, FlightRecord] = {f.scenario.controller: flown[f] for f in pair}
-        path = folder / "worst" / name.replace("/", "-") / f"{place:02d}-world-{world}"
-        style.save(snapshots_and_costs(shown), path)
+    for done, (name, path, line, (own, best)) in enumerate(missing, 1):
+        style.save(snapshots_and_costs({name: flown[own], CLAIRVOYANT: flown[best]}), path)
+        drawn.add(line)
         tell(len(flown) + done, of)

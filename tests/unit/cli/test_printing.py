@@ -59,6 +59,17 @@ def test_without_a_terminal_progress_comes_in_lines(lines: "Queue[str]") -> None
         say_until(lines, "exporting")
 
 
+def test_the_last_line_is_how_it_ended(
+    lines: "Queue[str]", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with progress_of("flights") as progress:
+        task = progress.add_task("", total=4, completed=3)
+        say_until(lines, "flights 3 of 4")
+        monkeypatch.setattr(printing, "LINE_EVERY_S", 1000.0)
+        progress.update(task, completed=4)
+    say_until(lines, "flights 4 of 4")
+
+
 @pytest.mark.usefixtures("lines")
 def test_they_end_with_the_work() -> None:
     before = threading.active_count()

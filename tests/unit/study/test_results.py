@@ -10,6 +10,7 @@ import pytest
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.failure import Failure, LostRobots
 from lpac.sim.scenario import Scenario
+from lpac.study.figures import pairs
 from lpac.study.flights import CLAIRVOYANT, CostCurve, PlannedFlight
 from lpac.study.results import as_json, results_of, verdict_of, worst_worlds
 from lpac.study.study import Condition, Method, Study, TrainedBundle
@@ -114,6 +115,11 @@ def test_what_is_told_is_what_was_flown() -> None:
     assert field["compared"]["better"] is None
     assert field["compared"]["a_below_b"][0] == pytest.approx(7 / 8)
     assert not field["compared"]["of_methods"]
+
+
+def test_pairs_say_whose_dots_these_are() -> None:
+    [legend] = pairs(PLAIN, RESULTS[PLAIN]).legends
+    assert [text.get_text() for text in legend.get_texts()] == ["one", "three"]
 
 
 def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:

@@ -1,17 +1,22 @@
 """From a study to its results."""
 
 import itertools
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from edge.policy.bundle import BundleError
+from lpac.analysis.figures import snapshots_and_costs
+from lpac.analysis.flight import FlightRecord
 from lpac.sim.cores import Outcome, Task, in_this_process
+from lpac.study import summary
 from lpac.study.flights import PlannedFlight
+from lpac.study.provenance import made_by_study
 from lpac.study.run import run, run_together
 from lpac.study.study import Condition, Method, Study
 from lpac.study.summary import report_of
@@ -82,6 +87,37 @@ def test_each_trial_in_each_world_is_told(tmp_path: Path) -> None:
     [(name, flown)] = run_together({"it": study}, in_this_process, tmp_path, lambda *_: None)
     told = report_of(name, study, flown, tmp_path, {}, {}).told
     assert [*told["flights"]] == [f"world {w}, trial {t}" for w in (0, 1) for t in (1, 2)]
+
+
+@pytest.mark.usefixtures("sketched")
+def test_a_report_says_what_flew_and_pictures_of_the_same_flights_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = replace(STUDY, figures=("worst",))
+    [(name, flown)] = run_together({"it": study}, in_this_process, tmp_path, lambda *_: None)
+    report_of(name, study, flown, tmp_path, made_by_study("study it", study), {}).write(tmp_path)
+    text = (tmp_path / "README.md").read_text()
+    for said in (
+        "1 robot in 162 x 162 units, 1 feature, range 256, 1 s, engine point",
+        f"ours: {SHIPPED.resolve()}, {study.methods[0].trainings[0].bundle_id[:12]}",
+        "[`worst`](worst) has pictures of the worst worlds, at most 10, of ours under the first",
+    ):
+        assert said in text
+    drawn: list[list[str]] = []
+
+    def draw(flights: Mapping[str, FlightRecord]) -> Figure:
+        drawn.append([*flights])
+        return snapshots_and_costs(flights)
+
+    monkeypatch.setattr(summary, "snapshots_and_costs", draw)
+    told: list[tuple[int, int]] = []
+    for _ in range(2):
+        summary.draw_worst(
+            study, flown.results, tmp_path, in_this_process, lambda *done: told.append(done)
+        )
+    # Each is flown, and drawn, once.
+    assert drawn == [["ours", "clairvoyant-cvt"]] * 2 and len(told) == 4 + 2
+    assert told[-1] == (6, 6) and len([*tmp_path.glob("worst/ours/*.png")]) == 2
 
 
 def test_a_method_needs_its_bundles() -> None:
