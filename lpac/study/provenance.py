@@ -3,6 +3,7 @@
 import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
+from pathlib import Path
 
 import edge
 import lpac
@@ -28,9 +29,15 @@ def made_by_study(command: str, study: Study) -> dict[str, str]:
     ids = [each.bundle_id for method in study.methods for each in method.trainings]
     first, last = study.draws[0].world, study.draws[-1].world
     policies = [
-        f"{method.name}: {each.path}, {each.bundle_id[:12]}"
+        f"{method.name}: {_from_here(each.path)}, {each.bundle_id[:12]}"
         for method in study.methods
         for each in method.trainings
     ]
     worlds = f"{first} to {last} of the {study.world_set} set, and their seeds"
     return made_by(command, ids, {"policies": "; ".join(policies), "worlds": worlds})
+
+
+def _from_here(path: str) -> str:
+    """Of what is below the working directory nothing that is of this machine alone."""
+    here = Path.cwd()
+    return str(Path(path).relative_to(here)) if Path(path).is_relative_to(here) else path

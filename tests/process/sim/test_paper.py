@@ -59,12 +59,12 @@ def test_trials_are_flown_over_cores(tmp_path: Path) -> None:
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
     no_worlds = called("paper", "async", "-k", 0, "--out", tmp_path)
-    assert error_line(no_worlds) == "lpac: worlds = 0: must be at least 1"
+    assert error_line(no_worlds) == "lpac: worlds = 0: must be from 1 to 10000"
     assert "absent" in error_line(called("paper", "async", "--bundle", "absent"))
     assert error_line(called("paper", "e2", "--trials", 1)).startswith("lpac: --trials 1: must be")
     assert (
         error_line(called("paper", "e3", "--world", -1))
-        == "lpac: first_world = -1: must be at least 0"
+        == "lpac: first_world = -1: must be from 0 to 1000000"
     )
     no_build = called("paper", "e3", "--vehicle", "px4", "--out", tmp_path)
     assert error_line(no_build) == "lpac: --vehicle px4 needs --px4 with PX4's build folder"

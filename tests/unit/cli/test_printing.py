@@ -62,12 +62,20 @@ def test_without_a_terminal_progress_comes_in_lines(lines: "Queue[str]") -> None
 def test_the_last_line_is_how_it_ended(
     lines: "Queue[str]", monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    is_done = threading.Event()
+
+    def echo(text: str, *, err: bool) -> None:
+        lines.put(text)
+        assert err and is_done.wait(60.0)
+
+    monkeypatch.setattr("typer.echo", echo)
     with progress_of("flights") as progress:
-        task = progress.add_task("", total=4, completed=3)
-        say_until(lines, "flights 3 of 4")
+        say_until(lines, "flights")
+        progress.add_task("", total=4, completed=4)
+        # No other line is due.
         monkeypatch.setattr(printing, "LINE_EVERY_S", 1000.0)
-        progress.update(task, completed=4)
-    say_until(lines, "flights 4 of 4")
+        is_done.set()
+    assert lines.get(timeout=60.0) == "flights 4 of 4"
 
 
 @pytest.mark.usefixtures("lines")

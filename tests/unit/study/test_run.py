@@ -21,7 +21,7 @@ from lpac.study.run import run, run_together
 from lpac.study.study import Condition, Method, Study
 from lpac.study.summary import report_of
 from lpac.study.worlds import SET_UPS
-from tests.conftest import SHIPPED
+from tests.conftest import ROOT, SHIPPED
 
 CONDITION = Condition(scenario=SET_UPS["n1"].scenario(duration_s=1.0))
 STUDY = Study(
@@ -93,13 +93,14 @@ def test_each_trial_in_each_world_is_told(tmp_path: Path) -> None:
 def test_a_report_says_what_flew_and_pictures_of_the_same_flights_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(ROOT)
     study = replace(STUDY, figures=("worst",))
     [(name, flown)] = run_together({"it": study}, in_this_process, tmp_path, lambda *_: None)
     report_of(name, study, flown, tmp_path, made_by_study("study it", study), {}).write(tmp_path)
     text = (tmp_path / "README.md").read_text()
     for said in (
         "1 robot in 162 x 162 units, 1 feature, range 256, 1 s, engine point",
-        f"ours: {SHIPPED.resolve()}, {study.methods[0].trainings[0].bundle_id[:12]}",
+        f"ours: {SHIPPED.relative_to(ROOT)}, {study.methods[0].trainings[0].bundle_id[:12]}",
         "[`worst`](worst) has pictures of the worst worlds, at most 10, of ours under the first",
     ):
         assert said in text
