@@ -21,6 +21,7 @@ from edge.messages.mission import (
     Echo,
     FlightState,
     GroundState,
+    Hold,
     LoopStatus,
     Order,
     OrderForm,
@@ -35,7 +36,7 @@ from handbook.markdown import cell, table
 from lpac.ground import record
 
 MESSAGES = (
-    RobotStatus, GroundState, Order, OrderResult, FailedCheck, Reason, Refusal, Origin, Fence,
+    RobotStatus, GroundState, Hold, Order, OrderResult, FailedCheck, Reason, Refusal, Origin, Fence,
     Place, Echo, LoopStatus, RadioCounts, Card, Revocations, SafetyForm, OrderForm,
 )  # fmt: skip
 CODES = (FlightState, CheckCode, ReasonCode, RefusalCode)

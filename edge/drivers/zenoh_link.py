@@ -12,7 +12,7 @@ connected and yet deaf to each other.
 
 With TLS both sides show a certificate of the fleet's authority, and what a peer says is taken by
 its certificate's common name: `robot-<id>` below its own key, `operator` below the ground's,
-`observer` there a state only. Names of hosts are not looked at, since robots have none. A router
+`observer` there a hold only. Names of hosts are not looked at, since robots have none. A router
 passes on what others say: it looks at who says what instead, so that behind it only the signatures
 of the messages tell who they are.
 """
@@ -40,7 +40,7 @@ from edge.drivers.door import Door, DoorStatus, listening
 from edge.messages.admission import Admission
 from edge.messages.topics import (
     GROUND_CARD,
-    STATE,
+    HOLD,
     TOPICS,
     Knocking,
     ReceiveCallback,
@@ -481,7 +481,7 @@ def _access_control(prefix: str) -> dict[str, object]:
     """Access rules below the prefix: publishers by their certificates' names; all hear all."""
     may_say = {
         "operator": [f"{prefix}ground/**"],
-        "observer": [f"{prefix}ground/{topic.name}" for topic in (STATE, GROUND_CARD)],
+        "observer": [f"{prefix}ground/{topic.name}" for topic in (HOLD, GROUND_CARD)],
         **{f"robot-{id_}": [f"{prefix}robot/{id_}/**"] for id_ in range(MAX_CERTIFIED_ID + 1)},
     }
     listening = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]

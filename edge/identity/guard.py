@@ -20,8 +20,8 @@ from edge.identity.signature import Signer
 from edge.messages.topics import (
     CARD,
     GROUND_CARD,
+    HOLD,
     REVOKED,
-    STATE,
     Link,
     ReceiveCallback,
     Topic,
@@ -573,5 +573,5 @@ def _is_of(card: Card, topic: Topic, key: str) -> bool:
 
 
 def _may_say(card: Card, topic: Topic, key: str) -> bool:
-    """An observer says a state, of which others take only hold."""
-    return _is_of(card, topic, key) and (card.role is not Role.OBSERVER or topic == STATE)
+    """An observer may ask for a hold, and nothing else."""
+    return _is_of(card, topic, key) and (card.role is not Role.OBSERVER or topic == HOLD)

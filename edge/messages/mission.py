@@ -50,6 +50,8 @@ from edge.messages.codes import FailedCheck, Reason, ReasonCode, Refusal
 # Of what is said now. A message of another version is taken as far as it can be; see the codec.
 VERSION = 3
 ORDER_LIFETIME_S = 10.0
+# Stations repeat a hold five times a second.
+HOLD_LASTS_S = 1.5
 Heading = Annotated[float, Meta(ge=0.0, lt=360.0)]
 SlotNumber = Annotated[int, Meta(ge=0, le=1000)]
 # A mission starts within this distance of the robot's own height.
@@ -200,6 +202,21 @@ class Order:
     trial: Name = ""
     version: Version = VERSION
     must_understand: MustUnderstand = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """A hold that a station asks for while another one commands, for as long as it is repeated.
+
+    `robots` that are not to fly on, by id; without any, all. It lasts `HOLD_LASTS_S` after it came.
+    """
+
+    by: Name
+    robots: Annotated[tuple[RobotId, ...], _OfRobots] = ()
+
+    def is_of(self, robot_id: int) -> bool:
+        """Whether that robot is to hold."""
+        return not self.robots or robot_id in self.robots
 
 
 @dataclass(frozen=True, slots=True)

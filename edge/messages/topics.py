@@ -46,6 +46,7 @@ EXPLORED = Topic("explored", "robot", "bits", 1.0, 5, 2**10, "later", None)
 # said within such a time of the last is not heard, which is why an order has none: those for all
 # robots of a fleet go at once.
 STATE = Topic("state", "ground", "GroundState", 5.0, 500, 2**16, "now", "ground", 50)
+HOLD = Topic("hold", "ground", "Hold", 5.0, 500, 2**14, "now", None, 50)
 ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")
 WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 50, 400_000, "later", None, 5)
 # Who is a member, and whose key is not good any more: signed by the fleet's authority. While
@@ -54,7 +55,7 @@ CARD = Topic("card", "robot", "Card", 0.1, 10, 2**11, "now", None)
 GROUND_CARD = Topic("card", "ground", "Card", 0.5, 100, 2**11, "now", None, 10)
 REVOKED = Topic("revoked", "ground", "Revocations", 0.5, 100, 2**15, "now", None, 10)
 
-TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, ORDER, WORLD, CARD, GROUND_CARD, REVOKED)
+TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, HOLD, ORDER, WORLD, CARD, GROUND_CARD, REVOKED)
 
 # By TCP a state goes to each robot by itself: so many of them a second are enough for a fleet, but
 # each robot needs some before it takes the ground for lost.

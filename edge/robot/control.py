@@ -122,6 +122,7 @@ class FlightControl:
         self.wanted_world_id: str | None = None
         self.world: GroundWorld | None = None
         self.obeyed_sequence = -1
+        self._ground_recorded: tuple[str, int, str] | None = None
         self.operator = ""
 
     def tick(self, now_s: float) -> bool:
@@ -132,7 +133,9 @@ class FlightControl:
         vehicle = self._vehicle.state()
         ground, ground_age_s = self._inbox.ground(now_s)
         if ground is not None:
-            if (ground.operator, ground.sequence) != (self.operator, self.obeyed_sequence):
+            told = ground.operator, ground.sequence, ground.safety_action_by
+            if told != self._ground_recorded:
+                self._ground_recorded = told
                 self._recorder.record("ground", self._unix_clock_s(), asdict(ground))
             self.obeyed_sequence, self.operator = ground.sequence, ground.operator
             self._hear_time(ground, now_s - ground_age_s)

@@ -15,7 +15,9 @@ from edge.identity.guard import Speaker
 from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import (
+    HOLD_LASTS_S,
     GroundState,
+    Hold,
     Order,
     OrderForm,
     SafetyAction,
@@ -29,11 +31,6 @@ _BEACON_LIFETIME_S = 3.0
 _GROUND_NAMES_WITHIN_S = 20.0
 # Whom the ground has heard for so long a robot hears, too, unless their radios do not reach.
 _HEARD_WITHIN_S = 5.0
-# A hold that somebody else than the commander asks for counts for as long as it is said; robots
-# hear a state five times a second. The commander's next states end it, so that nobody who asks for
-# one can get far ahead of the commander.
-_ASKED_HOLD_LASTS_S = 1.5
-_MOST_SEQUENCES_AHEAD = 1000
 
 
 class _Arrived(NamedTuple):
@@ -55,20 +52,14 @@ class _HeardByGround(NamedTuple):
     at_s: float
 
 
-class _AskedHold(NamedTuple):
-    by: str
-    sequence: int
-    at_s: float
-
-
 class Inbox:
     """`put_*` may be called from any thread, each other method from one thread."""
 
     def __init__(self, robot_id: int, ground_timeout_s: float) -> None:
         """Of several grounds' states the one with the greatest (sequence, operator) counts.
 
-        A smaller one does once no other came for the timeout. Of a state that another operator's
-        key signed, or an observer's, only a hold counts, while the commander asks for nothing.
+        A smaller one does once no other came for the timeout. A hold of another station, or of an
+        observer, counts while it is repeated and the commander asks for nothing.
         """
         self._robot_id = robot_id
         self._ground_timeout_s = ground_timeout_s
@@ -80,7 +71,9 @@ class Inbox:
         self._strangers: dict[str, float] = {}
         self._ground: GroundState | None = None
         self._ground_at_s = -math.inf
-        self._asked_hold: _AskedHold | None = None
+        self._holds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
+        self._held_by = ""
+        self._held_at_s = -math.inf
         self._safety_form: SafetyAction = "none"
         self._safety_form_at_s = -math.inf
         # Why the newest state of a ground was not understood; "" if it was.
@@ -96,6 +89,10 @@ class Inbox:
     def put_ground(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """A ground's state arrived."""
         self._grounds.append(_Arrived(data, speaker, now_s))
+
+    def put_hold(self, data: bytes, speaker: Speaker, now_s: float) -> None:
+        """A station's hold arrived."""
+        self._holds.append(_Arrived(data, speaker, now_s))
 
     def put_world(self, data: bytes) -> None:
         """A world file arrived."""
@@ -133,15 +130,7 @@ class Inbox:
                 self.ground_refusal = str(error)
                 self._take_safety_form(arrived)
                 continue
-            if not _is_own(state.operator, arrived.speaker):
-                # One that cannot count takes no other's place.
-                if state.safety_action_for(self._robot_id) == "hold" and self._is_a_little_ahead(
-                    state.sequence
-                ):
-                    self._asked_hold = _AskedHold(
-                        arrived.speaker.name, state.sequence, arrived.at_s
-                    )
-            elif self._counts(state, arrived.at_s):
+            if _is_own(state.operator, arrived.speaker) and self._counts(state, arrived.at_s):
                 self._ground, self._ground_at_s = state, arrived.at_s
                 self._put_echoes(state, arrived.at_s)
                 self._safety_form, self.ground_refusal = "none", ""
@@ -156,25 +145,27 @@ class Inbox:
                 self._heard_by_ground[robot_id] = _HeardByGround(since_s, at_s)
 
     def _with_asked_hold(self, now_s: float) -> GroundState | None:
-        ground, asked = self._ground, self._asked_hold
+        while self._holds:
+            arrived = self._holds.popleft()
+            try:
+                hold = decode(Hold, arrived.data)
+            except MessageError:
+                self.not_understood_count += 1
+                continue
+            if hold.is_of(self._robot_id) and arrived.speaker.name in ("", hold.by):
+                self._held_by, self._held_at_s = hold.by, arrived.at_s
+        ground = self._ground
         if (
             ground is None
-            or asked is None
-            or now_s - asked.at_s > _ASKED_HOLD_LASTS_S
-            or not self._is_a_little_ahead(asked.sequence)
+            or now_s - self._held_at_s > HOLD_LASTS_S
             or ground.safety_action_for(self._robot_id) != "none"
         ):
             return ground
         return replace(
             ground,
-            sequence=asked.sequence,
             robot_safety_actions=ground.robot_safety_actions | {str(self._robot_id): "hold"},
-            safety_action_by=asked.by,
+            safety_action_by=self._held_by,
         )
-
-    def _is_a_little_ahead(self, sequence: int) -> bool:
-        ground = self._ground
-        return ground is not None and 0 < sequence - ground.sequence <= _MOST_SEQUENCES_AHEAD
 
     def safety_form(self, now_s: float) -> SafetyAction:
         """Request of a ground whose states are not understood: hold, land, or none. Control thread.
@@ -189,13 +180,10 @@ class Inbox:
             form = decode(SafetyForm, arrived.data)
         except MessageError:
             return
-        if not self._counts(form, arrived.at_s):
+        if not (_is_own(form.operator, arrived.speaker) and self._counts(form, arrived.at_s)):
             return
         asked = form.robot_safety_actions.get(str(self._robot_id), form.safety_action)
         known: dict[str, SafetyAction] = {"hold": "hold", "land": "land"}
-        is_own = _is_own(form.operator, arrived.speaker)
-        if not is_own and (asked != "hold" or self.safety_form(arrived.at_s) == "land"):
-            return
         self._safety_form = known.get(asked, "none")
         self._safety_form_at_s = arrived.at_s
 

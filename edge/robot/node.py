@@ -31,6 +31,7 @@ from edge.messages.mission import (
 )
 from edge.messages.topics import (
     EXPLORED,
+    HOLD,
     MESSAGE,
     ORDER,
     STATE,
@@ -169,6 +170,7 @@ class RobotNode:
             {
                 MESSAGE: self._receive_message,
                 STATE: self._receive_state,
+                HOLD: self._receive_hold,
                 ORDER: self._receive_order,
                 WORLD: self._receive_world,
             }
@@ -180,6 +182,9 @@ class RobotNode:
 
     def _receive_state(self, _: str, data: bytes, speaker: Speaker) -> None:
         self._inbox.put_ground(data, speaker, self._ports.clock.monotonic_s())
+
+    def _receive_hold(self, _: str, data: bytes, speaker: Speaker) -> None:
+        self._inbox.put_hold(data, speaker, self._ports.clock.monotonic_s())
 
     def _receive_order(self, _: str, data: bytes, speaker: Speaker) -> None:
         self._inbox.put_order(data, speaker, self._ports.clock.monotonic_s())

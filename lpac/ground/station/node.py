@@ -15,9 +15,10 @@ from edge.core.ports import Clock
 from edge.identity.card import Role
 from edge.identity.guard import Guard, Speaker
 from edge.messages.codec import MessageError, decode, encode
-from edge.messages.mission import GroundState, RobotStatus
+from edge.messages.mission import GroundState, Hold, RobotStatus
 from edge.messages.topics import (
     EXPLORED,
+    HOLD,
     ORDER,
     STATE,
     STATUS,
@@ -76,7 +77,7 @@ class GroundNode:
         self._explored: dict[str, bytes] = {}
         self._told_setup = setup
         self._kept: GroundState | None = None
-        self._published: tuple[int | None, int] = None, 0
+        self._published: tuple[int | None, Hold | None, int] = None, None, 0
         self._state_at_s = -math.inf
         self._world_at_s = 0.0
         self._complained: set[str] = set()
@@ -84,7 +85,7 @@ class GroundNode:
     @property
     def subscriptions(self) -> Mapping[Topic, ReceiveCallback]:
         """Subscriptions: topic -> callback with the key and the data, in the node's thread."""
-        topics = (STATUS, EXPLORED, STATE, WORLD)
+        topics = (STATUS, EXPLORED, STATE, HOLD, WORLD)
         return self._guard.subscriptions(dict.fromkeys(topics, self._hear))
 
     def attach(self, link: Link) -> None:
@@ -164,6 +165,8 @@ class GroundNode:
         try:
             if topic == STATE.name:
                 self.station.hear_state(decode(GroundState, data), speaker)
+            elif topic == HOLD.name:
+                self.station.hear_hold(decode(Hold, data), speaker)
             elif topic == WORLD.name:
                 self.station.hear_world(data.decode(errors="replace"))
             else:
@@ -194,8 +197,10 @@ class GroundNode:
             # What is new does not wait for its turn.
             self._publish()
 
-    def _to_publish(self) -> tuple[int | None, int]:
-        return self.station.published_sequence, len(self.station.published_orders())
+    def _to_publish(self) -> tuple[int | None, Hold | None, int]:
+        station = self.station
+        sequence = station.state.sequence if station.commands and station.state else None
+        return sequence, station.published_hold, len(station.published_orders())
 
     def _publish(self) -> None:
         station = self.station
@@ -209,10 +214,13 @@ class GroundNode:
         self._guard.introduce()
         due = now_s - self._state_at_s > 1.0 / state_hz(len(station.setup.robots)) - _EARLY_S
         if due or self._published != before:
-            state = station.published_state()
+            state, hold = station.published_state(), station.published_hold
             if state is not None:
-                self._state_at_s = now_s
                 self._link.publish(STATE, encode(state))
+            if hold is not None:
+                self._link.publish(HOLD, encode(hold))
+            if state is not None or hold is not None:
+                self._state_at_s = now_s
         for order in station.published_orders():
             self._link.publish(ORDER, encode(order))
         world = station.published_world()

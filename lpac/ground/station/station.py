@@ -4,8 +4,8 @@ Pure: time is passed in, messages are handed in, and what is to be published is 
 thread at a time.
 
 Of several stations one commands: its name is the `operator` of the state that the robots obey, and
-it alone changes that state. The others observe. Only hold is everybody's: an observer publishes
-the commander's own state with hold in it and the next sequence, until the commander says so itself.
+it alone changes that state. The others observe. Only hold is everybody's: others repeat a `Hold`,
+which robots obey, until the commander's state has it.
 
 What robots say of whom they obey counts if most of them say so: one alone may be cut off, or lie.
 """
@@ -28,6 +28,7 @@ from edge.messages.mission import (
     Echo,
     FlightState,
     GroundState,
+    Hold,
     Order,
     OrderKind,
     OrderResult,
@@ -50,9 +51,8 @@ _ROBOTS_HEAR_NOBODY_S = 1.0
 _OVERTAKEN_S = 1.0
 # Who restarts knows of its robots only when it has heard them for a while.
 _GATHER_S = 3.0
-# Robots that heard this station's name a moment ago have heard another one of that name, unless it
-# was an observer's hold: that ends before this time. They hear a state five times a second, and say
-# so twice a second; one of either may be lost.
+# Robots that heard this station's name a moment ago have heard another one of that name. They hear
+# a state five times a second, and say so twice a second; one of either may be lost.
 _SPOKE_S = 1.2
 _NAME_TAKEN_S = 3.0
 _LATELY_S = 10.0
@@ -64,8 +64,8 @@ _EVENTS_KEPT = 200
 _ECHOED_S, _MOST_ECHOES = 0.3, 32
 _RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
-# Who asks for a hold gets the commander's sequence up by no more at a time.
-_MOST_SEQUENCES_AHEAD = 1000
+# A hold is repeated at least so long, if robots hold and the commander's state does not have it.
+_ASKED_AT_LEAST_S = 3.0
 # Beyond what most robots obey, none has heard a station.
 _MOST_OBEYED_AHEAD = 10**6
 
@@ -118,9 +118,9 @@ class Station:
         self._decided = False
         self._name_shared_at_s = -math.inf
         self._ahead_since_s: dict[int, float] = {}
-        # The hold that this station asks for while another commands, and of whom; None: of all.
-        self._asked: GroundState | None = None
-        self._asked_of: frozenset[int] | None = None
+        # The hold that this station asks for while another commands.
+        self._asked: Hold | None = None
+        self._asked_at_s = -math.inf
         self._orders: dict[str, tuple[Order, float]] = {}
         self._orders_made = 0
         self._expiries_s: dict[tuple[int, int], float] = {}
@@ -179,9 +179,6 @@ class Station:
             return 0.0
         heard_s = self._began_s if self.state is None else self._heard_s
         own_s = self._now_s - heard_s
-        if self._asked is not None and self.state is not None:
-            # The robots hear this station, in the commander's name.
-            return own_s
         told_s = [
             status.ground_age_s
             for status in self.statuses().values()
@@ -336,7 +333,7 @@ class Station:
         if not self.commands or state is None or obeyed <= _rank(state) or not heard:
             self._ahead_since_s.pop(status.robot_id, None)
             return
-        # An observer's hold, or another commander, mostly comes here too.
+        # Another commander mostly comes here too.
         self._ahead_since_s.setdefault(status.robot_id, self._now_s)
         ahead = self._ahead_of(state)
         if 2 * len(ahead) <= len(self.statuses()):
@@ -369,18 +366,13 @@ class Station:
                 self._refuse(order.order_id, RefusalCode.INTERRUPTED, self.interruption)
 
     def hear_state(self, state: GroundState, speaker: Speaker) -> None:
-        """Another station's state came.
-
-        Of one that is signed by another key than the operator's that it names only a hold counts.
-        """
-        if speaker.name not in ("", state.operator):
-            self._hear_asked_hold(state, speaker.name)
-            return
-        if speaker.role is not Role.OPERATOR:
+        """Another station's state came. It counts if its operator's key signed it."""
+        if speaker.name not in ("", state.operator) or speaker.role is not Role.OPERATOR:
             return
         if state.operator == self.operator:
-            if self._is_of_its_own(state):
-                return
+            own = self.state
+            if self.commands and own is not None and state.sequence <= own.sequence:
+                return  # Of this station's former life.
             self._tell_shared_name()
         before = self.state
         silent = not self.commands and self.commander_age_s > COMMANDER_SILENT_S
@@ -394,38 +386,17 @@ class Station:
             by = state.safety_action_by if _is_safer(before, state) else ""
             self._tell_changes(before, state, by or state.operator)
         self.state, self.commands, self._heard_s = state, False, self._now_s
-        if self._asked is not None and state.sequence >= self._asked.sequence:
-            asked = _held(state, self._asked_of, self.operator)
-            held = _holds(state, self._asked_of)
-            self._asked = None if held else replace(asked, sequence=state.sequence + 1)
 
-    def _is_of_its_own(self, state: GroundState) -> bool:
-        """Whether no other station of this name said it.
-
-        It may be an observer's hold, which is asked for in the commander's name and taken up here,
-        or a state of this station's former life.
-        """
+    def hear_hold(self, hold: Hold, speaker: Speaker) -> None:
+        """Another station asks for a hold: the commander takes it up."""
         own = self.state
-        if state.safety_action_by in ("", self.operator):
-            return self.commands and own is not None and state.sequence <= own.sequence
-        if self.commands and own is not None and state.sequence >= own.sequence:
-            after = replace(_with_hold_of(own, state), sequence=state.sequence + 1)
-            self._take_asked_hold(own, after, state.safety_action_by)
-        return True
-
-    def _hear_asked_hold(self, asked: GroundState, by: str) -> None:
-        own = self.state
-        if not self.commands or own is None or asked.operator != self.operator:
+        if not self.commands or own is None or speaker.name not in ("", hold.by):
             return
-        if not own.sequence < asked.sequence <= own.sequence + _MOST_SEQUENCES_AHEAD:
+        if hold.by == self.operator or _holds(own, hold):
             return
-        held = _with_hold_of(own, replace(asked, safety_action_by=by))
-        self._take_asked_hold(own, replace(held, sequence=asked.sequence + 1), by)
-
-    def _take_asked_hold(self, before: GroundState, after: GroundState, by: str) -> None:
-        self._tell_changes(before, after, by)
-        self.interruption = f"{by} commands hold"
-        self.state = after
+        self._tell_changes(own, _held(own, hold), hold.by)
+        self.interruption = f"{hold.by} commands hold"
+        self.state = replace(_held(own, hold), sequence=own.sequence + 1)
 
     def _tell_shared_name(self) -> None:
         if not self.shares_name:
@@ -608,20 +579,16 @@ class Station:
         return self.change(safety_action_by="", robot_safety_actions=asked, waiting=waiting)
 
     def hold(self, robots: Collection[int] | None = None) -> int:
-        """Hold, whoever commands; the sequence that says so."""
+        """Hold, whoever commands; the least sequence that robots obey then."""
         lost = self.commander_age_s > COMMANDER_SILENT_S
         if self.may_command and (self.commands or not self.commander or lost):
             return self._hold_as_commander(robots)
-        state = self._asked or self._known_state()
-        # Robots take a hold that is not the commander's if it is little ahead of its states.
-        sequence = min(
-            max(state.sequence, self._greatest_obeyed()) + 1,
-            max(state.sequence, self._obeyed_by_most()) + _MOST_SEQUENCES_AHEAD - 1,
-        )
-        asked_of: frozenset[int] | None = frozenset() if self._asked is None else self._asked_of
-        self._asked_of = None if robots is None or asked_of is None else asked_of | set(robots)
-        self._asked = replace(_held(state, self._asked_of, self.operator), sequence=sequence)
-        return sequence
+        before = self._asked
+        of_all = robots is None or (before is not None and not before.robots)
+        these = {*(robots or ()), *(before.robots if before is not None else ())}
+        self._asked = Hold(self.operator, () if of_all else tuple(sorted(these)))
+        self._asked_at_s = self._now_s
+        return 0
 
     def _hold_as_commander(self, robots: Collection[int] | None) -> int:
         self.safety_action("hold", robots)
@@ -633,19 +600,22 @@ class Station:
         self.state = replace(self.state, sequence=max(self.state.sequence, beyond))
         return self.state.sequence
 
-    def _end_asking(self, asked: GroundState) -> None:
+    def _end_asking(self, asked: Hold) -> None:
         """The commander takes the hold up, or is gone, or is out of reach of this station."""
         if self.may_command and self.commander_age_s > COMMANDER_SILENT_S:
             self.take_command()
-            self.change(
-                safety_action=asked.safety_action,
-                safety_action_by="",
-                robot_safety_actions=asked.robot_safety_actions,
-                waiting=asked.waiting,
+            assert self.state is not None
+            self.state = replace(
+                _held(self.state, asked), sequence=self.state.sequence + 1, safety_action_by=""
             )
-        elif self.state is None and all(
-            s.obeyed_sequence >= asked.sequence for s in self.statuses().values() if s.operator
-        ):
+            return
+        taken_up = self.state is not None and _holds(self.state, asked)
+        all_hold = all(
+            status.state is _S.HOLD or is_down(status)
+            for robot, status in self.statuses().items()
+            if asked.is_of(robot)
+        )
+        if taken_up or (all_hold and self._now_s - self._asked_at_s > _ASKED_AT_LEAST_S):
             self._asked = None
 
     def _bring_home(self) -> None:
@@ -736,17 +706,14 @@ class Station:
     # What is to be published, a few times a second
 
     @property
-    def published_sequence(self) -> int | None:
-        """Of the state that is to be published now; None: none is."""
-        state = self.state if self.commands and self.state is not None else self._asked
-        return None if state is None else state.sequence
+    def published_hold(self) -> Hold | None:
+        """The hold to ask for; None: none is."""
+        return self._asked
 
     def published_state(self) -> GroundState | None:
         """None: nothing is. In large fleets robots are echoed in turns, from call to call."""
         if not self.commands or self.state is None:
-            # The commander's time is not this station's to tell.
-            asked = self._asked
-            return None if asked is None else replace(asked, time_s=None, echoes={})
+            return None
         return replace(
             self.state,
             unix_time_s=self._unix_now_s,
@@ -850,40 +817,35 @@ def _is_at(status: RobotStatus, place: Place) -> bool:
     return math.dist(status.landing_point_m, place.landing_point_m) < _AT_PLACE_M
 
 
-def _held(state: GroundState, robots: Collection[int] | None, by: str) -> GroundState:
-    """The state with a hold of these robots, None: of all; and nothing else of it."""
-    if robots is None:
+def _held(state: GroundState, hold: Hold) -> GroundState:
+    """The state with that hold, and nothing else of it."""
+    if not hold.robots:
         return replace(
-            state, safety_action="hold", robot_safety_actions={}, safety_action_by=by, waiting=()
+            state,
+            safety_action="hold",
+            robot_safety_actions={},
+            safety_action_by=hold.by,
+            waiting=(),
         )
-    held: dict[str, SafetyAction] = dict.fromkeys(map(str, sorted(robots)), "hold")
-    waiting = tuple(robot for robot in state.waiting if robot not in robots)
+    held: dict[str, SafetyAction] = dict.fromkeys(map(str, hold.robots), "hold")
+    waiting = tuple(robot for robot in state.waiting if robot not in hold.robots)
     return replace(
         state,
         robot_safety_actions=state.robot_safety_actions | held,
-        safety_action_by=by,
+        safety_action_by=hold.by,
         waiting=waiting,
     )
 
 
-def _holds(state: GroundState, robots: Collection[int] | None) -> bool:
+def _holds(state: GroundState, hold: Hold) -> bool:
     """Whether the state has that hold."""
-    if robots is None:
-        return state.safety_action == "hold" and set(state.robot_safety_actions.values()) <= {
-            "hold"
-        }
-    return all(state.safety_action_for(robot) == "hold" for robot in robots)
-
-
-def _with_hold_of(state: GroundState, asked: GroundState) -> GroundState:
-    """The state with the hold that another station asks for."""
-    held = {
-        int(robot)
-        for robot, safety_action in asked.robot_safety_actions.items()
-        if safety_action == "hold"
-    }
-    held = held.difference(asked.waiting)
-    return _held(state, None if asked.safety_action == "hold" else held, asked.safety_action_by)
+    if not hold.robots:
+        actions = {state.safety_action, *state.robot_safety_actions.values()}
+        return actions == {"hold"} and not state.waiting
+    return all(
+        state.safety_action_for(robot) == "hold" and robot not in state.waiting
+        for robot in hold.robots
+    )
 
 
 def _is_safer(before: GroundState, after: GroundState) -> bool:

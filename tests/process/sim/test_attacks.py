@@ -24,7 +24,7 @@ from edge.identity.card import Role
 from edge.identity.guard import SignedGuard
 from edge.messages.codec import encode
 from edge.messages.mission import FlightState, GroundState, Order, RobotStatus
-from edge.messages.topics import ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
+from edge.messages.topics import HOLD, ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
 from lpac.fleet.authority import Authority, create_authority, new_member
 from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
@@ -328,9 +328,14 @@ def thief(rig: FleetRig) -> Iterator[Callable[[int], None]]:
         yield says
 
 
-def test_a_flood_with_an_observers_key_drowns_no_command(rig: FleetRig, tmp_path: Path) -> None:
-    """It may say states, of which robots take a hold alone; a revoked laptop can say as many."""
-    new_member(Authority(rig.fleet.folder / "keys", rig.fleet.name), tmp_path, Role.OBSERVER, "eve")
+@pytest.mark.parametrize(
+    ("role", "topic"), [(Role.OBSERVER, HOLD), (Role.OPERATOR, STATE), (Role.OPERATOR, HOLD)]
+)
+def test_a_flood_of_a_laptop_drowns_no_command(
+    rig: FleetRig, tmp_path: Path, role: Role, topic: Topic
+) -> None:
+    """Of an observer's, and of one that was an operator's and is revoked."""
+    new_member(Authority(rig.fleet.folder / "keys", rig.fleet.name), tmp_path, role, "eve")
     eve = load_identity(tmp_path, fleet=rig.fleet.name, unix_s=1.0)
     over = threading.Event()
     with session(rig.fleet, certified(eve.tls)) as opened:
@@ -339,7 +344,7 @@ def test_a_flood_with_an_observers_key_drowns_no_command(rig: FleetRig, tmp_path
             # The vehicles are simulated in this process, too.
             while not over.wait(0.002):
                 for _ in range(20):
-                    opened.put(f"lpac/{rig.fleet.name}/ground/state", bytes(100))
+                    opened.put(f"lpac/{rig.fleet.name}/{topic.pattern}", bytes(100))
 
         flooding = threading.Thread(target=flood)
         flooding.start()

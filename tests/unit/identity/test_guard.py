@@ -14,6 +14,7 @@ from edge.identity.signature import Signer
 from edge.messages.topics import (
     CARD,
     GROUND_CARD,
+    HOLD,
     MESSAGE,
     ORDER,
     REVOKED,
@@ -53,7 +54,9 @@ class Member:
         self.guard = SignedGuard(member, lambda: self.now_s, revocations)
         self.heard: list[tuple[str, bytes, Speaker]] = []
         topics: Mapping[Topic, ReceiveCallback] = self.guard.subscriptions(
-            dict.fromkeys((MESSAGE, STATUS, STATE, ORDER), lambda *said: self.heard.append(said))
+            dict.fromkeys(
+                (MESSAGE, STATUS, STATE, HOLD, ORDER), lambda *said: self.heard.append(said)
+            )
         )
         self._topics = topics
         self.sent: list[tuple[Topic, bytes]] = []
@@ -294,19 +297,19 @@ def test_a_ground_that_began_again_and_says_nothing_is_shown_the_cards_soon(one:
     assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
 
 
-def test_an_observer_says_a_state_and_nothing_else(one: Member) -> None:
+def test_an_observer_says_a_hold_and_nothing_else(one: Member) -> None:
     observer = Member(membership(Role.OBSERVER, "guest"))
     operator = Member(membership(Role.OPERATOR, "ann"))
-    for member, heard in ((observer, [True, False]), (operator, [True, True])):
-        sent = member.say(STATE, b"state")
-        assert [topic for topic, _ in sent] == [GROUND_CARD, STATE]
+    for member, heard in ((observer, [True, False, False]), (operator, [True, True, True])):
+        sent = member.say(HOLD, b"hold")
+        assert [topic for topic, _ in sent] == [GROUND_CARD, HOLD]
         one.hear(member, sent[:1])
-        said = [sent[1], member.say(ORDER, b"order")[-1]]
+        said = [sent[1], *(member.say(topic, b"other")[-1] for topic in (ORDER, STATE))]
         assert [one.takes(t, member.key(t), data) for t, data in said] == heard
     assert [speaker for *_, speaker in one.heard] == [
-        Speaker(Role.OBSERVER, "guest"), Speaker(Role.OPERATOR, "ann"),
-        Speaker(Role.OPERATOR, "ann"),
-    ]  # fmt: skip
+        Speaker(Role.OBSERVER, "guest"),
+        *[Speaker(Role.OPERATOR, "ann")] * 3,
+    ]
 
 
 def test_another_fleet_is_not_heard_even_of_the_same_name_and_key(one: Member) -> None:

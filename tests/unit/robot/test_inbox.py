@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from edge.identity.card import Role
 from edge.identity.guard import Speaker
 from edge.messages.codec import encode
-from edge.messages.mission import Echo, GroundState, Order, OrderForm, Origin
+from edge.messages.mission import Echo, GroundState, Hold, Order, OrderForm, Origin
 from edge.robot.inbox import Inbox
 from tests.unit.flight.test_preflight import NEIGHBOUR
 
@@ -237,56 +237,45 @@ def test_whom_the_ground_hears_and_this_robot_does_not() -> None:
 def test_of_who_does_not_command_only_a_hold_counts() -> None:
     ann, bob = Speaker(Role.OPERATOR, "ann"), Speaker(Role.OPERATOR, "bob")
     guest = Speaker(Role.OBSERVER, "guest")
-    inbox = Inbox(3, 3.0)
     state = dataclasses.replace(STATE, operator="ann", safety_action="none")
-    after = state.sequence + 1
 
-    def obeyed(**changes: object) -> tuple[str, int]:
-        """Asked by another than the commander, just before 1.0 s."""
+    def asked(inbox: Inbox, now_s: float) -> tuple[str, str]:
+        ground, _ = inbox.ground(now_s)
+        assert ground is not None
+        assert (ground.operator, ground.sequence) == ("ann", state.sequence)
+        return ground.safety_action_for(3), ground.safety_action_by
+
+    def make() -> Inbox:
+        inbox = Inbox(3, 3.0)
         inbox.put_ground(encode(state), ann, 0.9)
-        asked = dataclasses.replace(state, **{"sequence": after, **changes})  # type: ignore[arg-type]
-        inbox.put_ground(encode(asked), speaker, 0.95)
-        ground, age_s = inbox.ground(1.0)
-        assert ground is not None and ground.operator == "ann" and age_s == pytest.approx(0.1)
-        return ground.safety_action_for(3), ground.sequence
+        return inbox
 
     for speaker in (bob, guest):
-        inbox = Inbox(3, 3.0)
-        assert obeyed(safety_action="land") == ("none", state.sequence)
-        assert obeyed(enabled=False, robot_safety_actions={"4": "hold"}) == ("none", state.sequence)
-        # Nobody gets far ahead of the commander.
-        assert obeyed(safety_action="hold", sequence=after + 10**6) == ("none", state.sequence)
-        assert obeyed(safety_action="hold") == ("hold", after)
-        ground, _ = inbox.ground(2.4)
-        assert ground is not None and ground.safety_action_by == speaker.name
-        # One that cannot count does not take its place.
-        far = dataclasses.replace(state, sequence=after + 10**6, safety_action="hold")
-        inbox.put_ground(encode(far), guest, 2.4)
-        ground, _ = inbox.ground(2.4)
-        assert ground is not None and ground.safety_action_for(3) == "hold"
-        # It ends with whoever says it, and with what the commander says next.
-        assert inbox.ground(2.5)[0] == state
-        assert obeyed(robot_safety_actions={"3": "hold"}) == ("hold", after)
-        goes_on = dataclasses.replace(state, sequence=after)
-        inbox.put_ground(encode(goes_on), ann, 1.05)
-        assert inbox.ground(1.05)[0] == goes_on
-        landing = dataclasses.replace(state, sequence=after, safety_action="land")
-        inbox.put_ground(encode(landing), ann, 1.1)
-        assert inbox.ground(1.1)[0] == landing
-    # Nor does one that can only be understood in part.
-    inbox = Inbox(3, 3.0)
-    for action, known in (("land", "none"), ("hold", "hold")):
-        data = newer(state, sequence=after, safety_action=action)
-        inbox.put_ground(data, guest, 1.0)
-        inbox.ground(1.0)
-        assert inbox.safety_form(1.0) == known
-    # Or takes back what somebody else asks for.
-    for action, taken_back in (("hold", ("none", "land")), ("land", ("none", "hold", "land"))):
-        inbox.put_ground(newer(state, sequence=after, safety_action=action), ann, 2.0)
-        for other in taken_back:
-            inbox.put_ground(newer(state, sequence=after, safety_action=other), guest, 2.0)
-        inbox.ground(2.0)
-        assert inbox.safety_form(2.0) == action
+        for hold in (Hold(speaker.name), Hold(speaker.name, (2, 3))):
+            inbox = make()
+            inbox.put_hold(encode(hold), speaker, 0.95)
+            assert asked(inbox, 1.0) == ("hold", speaker.name)
+            # It ends with whoever says it.
+            assert asked(inbox, 2.4) == ("hold", speaker.name)
+            assert asked(inbox, 2.5) == ("none", "")
+        # Of others, in another's name, and a state that is not its operator's own.
+        inbox = make()
+        inbox.put_hold(encode(Hold(speaker.name, (4,))), speaker, 0.95)
+        inbox.put_hold(encode(Hold("eve")), speaker, 0.95)
+        inbox.put_hold(b"{}", speaker, 0.95)
+        for action in ("hold", "land"):
+            other = dataclasses.replace(state, sequence=state.sequence + 1, safety_action=action)
+            inbox.put_ground(encode(other), speaker, 0.95)
+            inbox.put_ground(newer(other), speaker, 0.95)
+        assert asked(inbox, 1.0) == ("none", "")
+        assert inbox.safety_form(1.0) == "none"
+    # What the commander asks for goes before.
+    inbox = make()
+    landing = dataclasses.replace(state, safety_action="land")
+    inbox.put_hold(encode(Hold("bob")), bob, 0.95)
+    inbox.put_ground(encode(landing), ann, 1.0)
+    assert asked(inbox, 1.0) == ("land", "")
+    assert Inbox(3, 3.0).ground(0.0)[0] is None
 
 
 def test_an_order_is_its_operators_own() -> None:
