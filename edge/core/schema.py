@@ -305,11 +305,14 @@ def _not_of(kind: Any, value: object) -> str:
         return f" = {_shown(value)}: allowed are {allowed}"
     if kind is float and type(value) is int:
         return ": is too large a number"
-    words = {dict: "a table", str: "text in quotes", tuple: "a list"}
+    words = {
+        dict: "a table", str: "text in quotes", tuple: "a list", int: "a whole number",
+        float: "a number", bool: "true or false",
+    }  # fmt: skip
     expected = words.get(origin or kind, getattr(kind, "__name__", str(kind)))
     if origin is tuple and Ellipsis not in arguments:
         expected = f"a list of {len(arguments)}"
-    return f" = {_shown(value)}: expected {expected}"
+    return f" = {_shown(value)}: must be {expected}"
 
 
 def _shown(value: object) -> str:

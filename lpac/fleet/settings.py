@@ -476,7 +476,7 @@ def _check_keys(table: Mapping[str, Any], elsewhere: Mapping[str, str], where: s
         head, _, rest = key.partition(".")
         inner = table.get(head, {})
         if rest and not isinstance(inner, dict):
-            raise ConfigError(f"{where}: {head} = {inner!r}: expected a table")
+            raise ConfigError(f"{where}: {head} = {inner!r}: must be a table")
         if (rest in inner) if rest else (head in table):
             raise ConfigError(f"{where}: {key} must not be set here: {place}")
 

@@ -439,7 +439,7 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ('# on_stop = "hold"', "robot_id = 1", ["robot: robot_id must not", "[robots.NAME]"]),
         ('# on_stop = "hold"', 'policy.bundle = "x"', ["robot: policy.bundle must not", "top"]),
         ('# on_stop = "hold"', 'policy.world = "x"', ["robot: policy.world must not", "top"]),
-        ('# on_stop = "hold"', "policy = 1", ["robot: policy = 1", "expected a table"]),
+        ('# on_stop = "hold"', "policy = 1", ["robot: policy = 1", "must be a table"]),
         ('# on_stop = "hold"', "link.scouting = true", ["robot: link must not", "zenoh_port"]),
         ('# on_stop = "hold"', "flight.slot = 1", ["robot: flight.slot must not", "`height`"]),
         ('# on_stop = "hold"', "flight.landing_point_m = 1", ["robot: flight.landing_point_m"]),
@@ -512,7 +512,7 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
             ["height = 1: is 13.5 m, 8.5 m from that of", "must be 9 m (min_separation_m)"],
         ),
         ("buffer_m = 1.5", "buffer_m = 1.0", ["robots.r1, in slots[0]: buffer_m = 1: must be 1.3"]),
-        ("[robot]\n#", "[[robot]]\n#", ["robot = [{", "expected a table"]),
+        ("[robot]\n#", "[[robot]]\n#", ["robot = [{", "must be a table"]),
         ("[[slots]]\nrobot = \"r1\"", "[slots]", ["is not TOML"]),
     ],
 )  # fmt: skip

@@ -91,7 +91,7 @@ def test_examples_comments_show_the_defaults(script: Path) -> None:
         ("# interval_s = 2.0", "interval_s = -1", r"steps\[1\] \(takeoff\): interval_s = -1: must"),
         ("# interval_s", "intervall_s", r"steps\[1\] \(takeoff\): unknown key 'intervall_s'"),
         ("duration_s = 120.0", "", r"steps\[2\] \(mission\): duration_s is missing"),
-        ("duration_s = 120.0", 'duration_s = ""', r"\(mission\): duration_s = '': expected float"),
+        ("duration_s = 120.0", 'duration_s = ""', r"\(mission\): duration_s = '': must be a num"),
         ("at_s = 80.0", "at_s = 121.0", "perturb: at_s = 121.0: must be below duration_s = 120.0"),
         ('do = "rejoin"', 'do = "kill"', r"perturb\[1\]: do = 'kill': allowed are 'pilot', "),
         ("heading_deg = 30.0", "heading_deg = 360.0", r"before\[0\] \(origin\): heading_deg = "),

@@ -106,7 +106,7 @@ def test_a_status_has_a_time_and_a_place_to_go_to(odd: dict[str, Any]) -> None:
     ("key", "value", "said"),
     [
         ("sequence", int("9" * 4300), "sequence = 999"), ("sequence", -2, "-2: must be from -1 to"),
-        ("sequence", 1.5, "sequence = 1.5: expected int"),
+        ("sequence", 1.5, "sequence = 1.5: must be a whole number"),
         ("operator", "x" * 129, "must be at most 128 long"),
         ("robot_enabled", {"all": True}, "robot_enabled: key = 'all': must be like ^[0-9]{1,5}$"),
         ("robot_enabled", {str(n): True for n in range(1001)}, "must be at most 1000 long"),

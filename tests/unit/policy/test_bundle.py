@@ -186,7 +186,7 @@ def resealed(bundle: Bundle, folder: Path, change: dict[str, object]) -> Path:
     ("change", "text"),
     [
         ({"schema": 2}, "schema = 2: this version reads 1"),
-        ({"schema": "1"}, "schema = '1': expected int"),
+        ({"schema": "1"}, "schema = '1': must be a whole number"),
         ({"colour": "red"}, "unknown key 'colour'; known are opset, geometry, images"),
         ({"geometry": {"hops": 0, "feature_sizes": [34, 256]}}, "hops = 0: must be at least 1"),
         ({"geometry": {"hops": 3}}, "geometry: feature_sizes is missing"),
@@ -194,7 +194,7 @@ def resealed(bundle: Bundle, folder: Path, change: dict[str, object]) -> Path:
         ({"training": {"max_speed": -5.0, "time_step": 0.2}}, "max_speed = -5.0: must be above 0"),
         ({"files": {}}, "action.onnx does not belong to the bundle"),
         ({"payload_types": ["int4"]}, "payload_types[0] = 'int4': allowed are 'float32'"),
-        ({"opset": 20.5}, "opset = 20.5: expected int"),
+        ({"opset": 20.5}, "opset = 20.5: must be a whole number"),
         ({"family": "other"}, "is of the family 'other', not 'lpac'"),
     ],
 )

@@ -77,7 +77,7 @@ def test_relative_paths_are_meant_from_the_files_folder(
     ("old", "new", "names"),
     [
         ("robot_id = 0", "robot_id = -1", ["robot_id = -1", "0 to 65535"]),
-        ("robot_id = 0", 'robot_id = "0"', ["robot_id", "'0'", "int"]),
+        ("robot_id = 0", 'robot_id = "0"', ["robot_id", "'0'", "a whole number"]),
         ("robot_id = 0", "robot_ids = 0", ["unknown key 'robot_ids'", "robot_id,"]),
         ('fleet = "demo"', "", ["fleet is missing"]),
         ('fleet = "demo"', 'fleet = "a/b"', ["fleet = 'a/b'", "letters"]),
@@ -127,7 +127,7 @@ def test_relative_paths_are_meant_from_the_files_folder(
         ("[34.0, 34.0]", "[8.0, 8.0]", ["fence: vertices_m", "convex"]),
         ("ceiling_m = 30.0", "ceiling_m = 1.0", ["fence: ceiling_m = 1.0", "floor_m = 2.0"]),
         ("lag_s = 1.3", "lag_s = nan", ["limits: lag_s = nan", "finite"]),
-        ("lag_s = 1.3", "lag_s = true", ["limits: lag_s", "True", "float"]),
+        ("lag_s = 1.3", "lag_s = true", ["limits: lag_s", "True", "a number"]),
         ('rc = "pilot"', 'rc = "maybe"', ["failsafe: rc = 'maybe'", "'pilot', 'none'"]),
         ("# fence_margin_m = 5.0", "fence_margin_m = -1.0", ["failsafe: fence_margin_m = -1.0"]),
         ("# command_timeout_s = 0.5", "command_timeout_s = 0.1", ["command_timeout_s = 0.1"]),

@@ -83,7 +83,7 @@ def test_what_an_engine_cannot_do_comes_from_another_process() -> None:
     ("values", "said"),
     [
         ({"controller": "cvt"}, "controller = 'cvt': allowed are 'lpac', "),
-        ({"robots": "3"}, "robots = '3': expected int"),
+        ({"robots": "3"}, "robots = '3': must be a whole number"),
         ({"duration_s": 1e12}, "duration_s = 1000000000000.0: must be above 0 and at most 86400"),
         ({"wind_m_s": 300.0}, "wind_m_s = 300.0: must be from 0 to 30"),
     ],

@@ -94,7 +94,7 @@ def test_a_world_of_ones_own_and_paths_count_from_the_files_folder(tmp_path: Pat
         ('"simulated"', '"gazebo"', "conditions[1]: engine = 'gazebo': allowed are 'point', "),
         ("world_size", "world_sise", "scenario: unknown key 'world_sise'; known are title, engine"),
         ("= 640", "= 0", "scenario: world_size = 0: must be at least 1"),
-        ("= 640", '= "640"', "scenario: world_size = '640': expected int"),
+        ("= 640", '= "640"', "scenario: world_size = '640': must be a whole number"),
         ("world_size = 640", "seed = 1", "scenario: unknown key 'seed'; known are "),
         ("world_size = 640", 'set_up = "n4"', "scenario: set_up = 'n4': allowed are field, n1, "),
         ("decentralized-cvt-prior", "cvt", "baselines[0] = 'cvt': allowed are "),

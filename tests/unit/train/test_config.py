@@ -16,7 +16,7 @@ from tests.training import SMALL, read
         ("seed = 3", "seed = -1", "small.toml: seed = -1: must be at least 0"),
         ("seed = 3", "speed = 3", "small.toml: unknown key 'speed'; known are perception, "),
         ("flights = 2", "flights = 0", "data: flights = 0: must be at least 1"),
-        ("flights = 2", "flights = 2.5", "data: flights = 2.5: expected int"),
+        ("flights = 2", "flights = 2.5", "data: flights = 2.5: must be a whole number"),
         ("flights = 2\n", "", "data: flights is missing"),
         ("states = 3", 'expert = "me"', "data: expert = 'me': allowed are 'clairvoyant-cvt', "),
         ("duration_s = 2.0", "duration_s = 0.5", "data: duration_s = 0.5: must be from 1 to 3600"),
