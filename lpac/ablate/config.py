@@ -16,7 +16,7 @@ import tomlkit
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.toml import read_toml
 from lpac.study.file import condition_of, merged
-from lpac.study.study import Condition
+from lpac.study.study import BASELINES, Condition
 from lpac.train.config import ReadConfig, TrainingConfig, config_of, require_name
 
 BASE = "base"
@@ -44,8 +44,8 @@ class Variant:
 
     def __post_init__(self) -> None:
         require_name(self.name)
-        if self.name == BASE:
-            raise ValueError(f"name = {BASE!r}: is what the variants are held against")
+        if self.name in (BASE, *BASELINES):
+            raise ValueError(f"name = {self.name!r}: is what the variants are held against")
         if not self.why.strip() or "\n" in self.why.strip():
             raise ValueError(f"why = {self.why!r}: must be a sentence, on one line")
         if not self.train and not self.fly:

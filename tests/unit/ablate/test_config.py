@@ -91,6 +91,7 @@ def test_whatever_a_configuration_says_is_what_the_training_is_told(tmp_path: Pa
         ("fly.loss = 0.1", "fly.delay = 2.0", "base: fly: unknown key 'delay'; known are "),
         ('"slow"', '"no-features"', "name = 'no-features': must be one variant's alone"),
         ('"slow"', '"base"', r"variants\[1\]: name = 'base': is what the variants are held"),
+        ('"slow"', '"clairvoyant-cvt"', r"name = 'clairvoyant-cvt': is what the variants are held"),
         ('"slow"', '"a/b"', r"variants\[1\]: name = 'a/b': must be letters, digits"),
         ('"Perception and policy are slow."', '" "', r"variants\[1\]: why = ' ': must be a sent"),
         ("fly.clocks = ", "# ", r"variants\[1\]: train, fly: one of them must say"),
