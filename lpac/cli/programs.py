@@ -15,8 +15,11 @@ if TYPE_CHECKING:
     from lpac.sim.fleet.processes import Fleet
 
 
-def serve(fleet: "Fleet", display: "FleetDisplay") -> None:
-    """Run the fleet for `lpac ground` until Ctrl-C, and only listen to it."""
+def serve(fleet: "Fleet", fleet_toml: Path, display: "FleetDisplay") -> None:
+    """Run the fleet for `lpac ground` until Ctrl-C, and only listen to it.
+
+    `fleet_toml` is its description, as the user knows it.
+    """
     from edge.core.counted import counted
 
     with fleet:
@@ -27,7 +30,7 @@ def serve(fleet: "Fleet", display: "FleetDisplay") -> None:
         fleet.begin()
         display.print(
             f"{counted(len(fleet.robots), 'robot')} until Ctrl-C; in a second terminal:\n\n"
-            f"  export LPAC_FLEET={shlex.quote(str(fleet.folder / fleet.fleet_toml.name))}\n"
+            f"  export LPAC_FLEET={shlex.quote(str(fleet_toml))}\n"
             "  lpac ground\n"
         )
         try:

@@ -3,7 +3,6 @@
 import os
 import pickle
 import signal
-import tempfile
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -11,10 +10,8 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import NamedTemporaryFile
 from typing import Any, Protocol, TypeVar
-
-_TASKS = "tasks.pickle"
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
@@ -56,16 +53,16 @@ def over_processes(
     """
     # Workers read the tasks from a file: who waits for a worker that was killed to take a large one
     # from a pipe waits forever.
-    # What they leave in files of their own when they are interrupted goes with that folder.
-    with TemporaryDirectory(prefix="lpac-tasks-") as folder:
-        (Path(folder) / _TASKS).write_bytes(pickle.dumps((do, tasks)))
-        yield from _from_workers(min(len(tasks), at_most), len(tasks), folder)
+    with NamedTemporaryFile(prefix="lpac-tasks-") as file:
+        pickle.dump((do, tasks), file)
+        file.flush()
+        yield from _from_workers(min(len(tasks), at_most), len(tasks), file.name)
 
 
-def _from_workers(workers: int, tasks: int, folder: str) -> Generator[Any, None, None]:
+def _from_workers(workers: int, tasks: int, path: str) -> Generator[Any, None, None]:
     with _without_interrupts():
         # A fork would inherit threads that do not run there.
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (folder,))
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (path,))
     try:
         with _without_interrupts():
             given: list[Future[Any]] = [pool.submit(_do_nth, n) for n in range(tasks)]
@@ -114,12 +111,12 @@ def _without_interrupts() -> Iterator[None]:
 _given: tuple[Callable[[Any], Any], Sequence[Any]]
 
 
-def _begin(folder: str) -> None:
+def _begin(path: str) -> None:
     """A worker knows what to do before it is told which."""
     global _given  # noqa: PLW0603
     _obey_parent()
-    tempfile.tempdir = folder
-    _given = pickle.loads((Path(folder) / _TASKS).read_bytes())
+    with Path(path).open("rb") as file:
+        _given = pickle.load(file)
 
 
 def _do_nth(n: int) -> Any:

@@ -295,7 +295,7 @@ def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -
     [
         (["-n", "0"], "--robots 0: must be at least 1"),
         (["-n", "31"], "robots = 31: must be from 1 to 30"),
-        (["--duration", "0"], "--duration = 0.0: must be above 0 and finite"),
+        (["--duration", "0"], "--duration = 0.0: must be above 0 and at most 86400"),
         (["--loss", "0.1"], "--loss does nothing with --vehicle mavlink"),
         (["--wifi", "wifi.toml"], "--wifi does nothing without --transport"),
         (["--controller", "shared-cvt"], "--controller does nothing with --vehicle mavlink"),
