@@ -50,7 +50,8 @@ LAST = int(3.0 / SNAPSHOT_PERIOD_S)
 # simulated clock, which draws them, costs at the end were 0.46 to 0.52 of the first one, places up
 # to 1.5 m apart. A flight of programs must be one of these, within a metre of that robot on which
 # the cost hangs most: 4 % of it.
-DRAWS = 6
+# With fewer a flight now and then is like none of them.
+DRAWS = 12
 COST_TOLERANCE = 0.03
 START_TOLERANCE_M, END_TOLERANCE_M = 0.5, 1.2
 # Where a robot takes its pad to be, and what its landing leaves.
