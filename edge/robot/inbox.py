@@ -39,12 +39,6 @@ class _Arrived(NamedTuple):
     at_s: float
 
 
-class _ArrivedOrder(NamedTuple):
-    data: bytes
-    speaker: Speaker
-    at_s: float
-
-
 class _HeardByGround(NamedTuple):
     """Since when the ground names a robot among those that it hears, and when it did last."""
 
@@ -65,7 +59,7 @@ class Inbox:
         self._ground_timeout_s = ground_timeout_s
         self._lock = Lock()
         self._grounds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
-        self._orders: deque[_ArrivedOrder] = deque(maxlen=_MOST_ORDERS)
+        self._orders: deque[_Arrived] = deque(maxlen=_MOST_ORDERS)
         self._beacons: dict[int, HeardBeacon] = {}
         # When robots, by what they are called, said what is no beacon of this version.
         self._strangers: dict[str, float] = {}
@@ -100,7 +94,7 @@ class Inbox:
 
     def put_order(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """An order arrived."""
-        self._orders.append(_ArrivedOrder(data, speaker, now_s))
+        self._orders.append(_Arrived(data, speaker, now_s))
 
     def put_beacon(self, beacon: Beacon, now_s: float) -> None:
         """Another robot's beacon arrived."""

@@ -111,9 +111,11 @@ class _WholeRobots(ABC):
         records = []
         for scenario in scenarios:
             with TemporaryDirectory(prefix="lpac-sim-") as nowhere:
-                path = Path(nowhere) / "bundle" if isinstance(bundle, Bundle) else bundle
                 if isinstance(bundle, Bundle):
+                    path = Path(nowhere) / "bundle"
                     write_bundle(bundle, path)
+                else:
+                    path = bundle
                 flown_in = folder or Path(nowhere) / "flight"
                 records.append(self._fly(scenario, path, flown_in, watch, logs=bool(folder)))
         return records

@@ -394,9 +394,10 @@ class Station:
             return
         if hold.by == self.operator or _holds(own, hold):
             return
-        self._tell_changes(own, _held(own, hold), hold.by)
+        held = _held(own, hold)
+        self._tell_changes(own, held, hold.by)
         self.interruption = f"{hold.by} commands hold"
-        self.state = replace(_held(own, hold), sequence=own.sequence + 1)
+        self.state = replace(held, sequence=own.sequence + 1)
 
     def _tell_shared_name(self) -> None:
         if not self.shares_name:
