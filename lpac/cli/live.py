@@ -2,28 +2,25 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Literal, Self
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Self
 
 import typer
 
-from lpac.cli.printing import BAD, LINE_EVERY_S, NOTABLE, new_table, plain, styled
+from lpac.cli.printing import LINE_EVERY_S, STYLES, new_table, plain, styled
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.live import Live
     from rich.table import Table
-    from rich.text import Text
 
     from edge.messages.mission import RobotStatus
+    from lpac.ground.rendering import Row
     from lpac.sim.fleet.listener import Statuses
 
 _DRAW_EVERY_S = 0.5
-# Between the names and the last column, which takes what is left: 27 cells of 80.
-_COLUMNS: tuple[tuple[str, int, Literal["left", "right"]], ...] = (
-    ("state", 9, "left"), ("x", 5, "right"), ("y", 5, "right"),
-    ("height", 6, "right"), ("m/s", 4, "right"), ("hears", 5, "right"), ("battery", 7, "right"),
-)  # fmt: skip
+# Between the names and the last column, which takes what is left.
+_COLUMNS = ("state", "x", "y", "height", "speed", "neighbours", "battery")
 
 
 class FleetDisplay:
@@ -79,7 +76,7 @@ class FleetDisplay:
         if self._live.is_started and now_s - self._told_s >= _DRAW_EVERY_S:
             self._told_s = now_s
             title = plain(f"{now_s - self._began_s:.0f} s: {step}")
-            table = fleet_table({f"r{r}": statuses.get(r) for r in self._robots})
+            table = fleet_table(_row(robot, statuses.get(robot)) for robot in self._robots)
             # The cursor stays behind a short line: Ctrl-C's echo breaks none then.
             self._live.update(Group(title, table, ""), refresh=True)
 
@@ -93,33 +90,33 @@ class FleetDisplay:
             self.say(f"{step}; robots: {counts or 'not heard yet'}")
 
 
-def fleet_table(statuses: "Mapping[str, RobotStatus | None]") -> "Table":
-    """A line for each robot's name, whatever is in it and however wide the terminal is."""
+def _row(robot: int, status: "RobotStatus | None") -> "Row":
+    from lpac.analysis.snapshot import RobotSnapshot
+    from lpac.ground.rendering import Row
+
+    age_s = None if status is None else 0.0
+    return Row(RobotSnapshot(f"r{robot}", robot, status, age_s))
+
+
+def fleet_table(rows: "Iterable[Row]") -> "Table":
+    """A line for each robot, whatever is in it and however wide the terminal is."""
+    from lpac.ground.rendering import COLUMN, cell
+
+    rows = list(rows)
     table = new_table(narrow=True)
     table.expand = True
-    table.add_column("robot", width=max([5, *map(len, statuses)]), no_wrap=True)
-    for heading, width, justify in _COLUMNS:
-        table.add_column(heading, width=width, justify=justify, no_wrap=True)
+    longest = max((len(row.robot.name) for row in rows), default=0)
+    table.add_column("robot", width=max(5, longest), no_wrap=True)
+    for key in _COLUMNS:
+        _, _, top, unit, width, _, left = COLUMN[key]
+        table.add_column(
+            f"{top} {unit}".strip(), width=max(width, len(top) + 1 + len(unit)),
+            justify="left" if left else "right", no_wrap=True,
+        )  # fmt: skip
     table.add_column("", ratio=1, no_wrap=True, overflow="ellipsis")
-    for robot, status in statuses.items():
-        cells = [styled("not heard", BAD)] if status is None else _cells(status)
-        table.add_row(plain(robot), *cells)
+    for row in rows:
+        cells = [cell(row, key) for key in (*_COLUMNS, "problem")]
+        table.add_row(
+            plain(row.robot.name), *(styled(text.strip(), STYLES[style]) for text, style in cells)
+        )
     return table
-
-
-def _cells(status: "RobotStatus") -> list["Text"]:
-    from edge.messages.codes import texts
-    from edge.messages.mission import FlightState
-
-    position_m = status.position_m or ()
-    speed_m_s = sum(v * v for v in (status.velocity_m_s or ())[:2]) ** 0.5
-    told = (
-        *(f"{metres:.1f}" for metres in position_m),
-        *("" for _ in range(3 - len(position_m))),
-        f"{speed_m_s:.1f}",
-        str(len(status.neighbour_ages_s)),
-        "" if status.battery is None else f"{100.0 * status.battery:.0f} %",
-        texts(status.alarms if status.armed else status.failed_checks) or status.reason.text,
-    )
-    style = "" if status.state is FlightState.MISSION else NOTABLE
-    return [styled(status.state.value, style), *map(plain, told)]

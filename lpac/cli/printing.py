@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 GOOD, BAD, NOTABLE, FAINT = "green", "red", "yellow", "dim"
+# Of what `lpac.ground.rendering` says, where a command prints it.
+STYLES = {
+    "": "", "good": GOOD, "calm": NOTABLE, "busy": NOTABLE, "foreign": NOTABLE, "faint": FAINT,
+    "critical": BAD, "warning": NOTABLE, "note": FAINT,
+}  # fmt: skip
 
 # Where there is no terminal to show it live, how far a command is gets a line so often, s.
 LINE_EVERY_S = 10.0

@@ -149,12 +149,10 @@ class _View:
         from rich.text import Text
 
         from lpac.cli.live import fleet_table
+        from lpac.ground.alarms import alarms
+        from lpac.ground.rendering import rows
 
-        table = fleet_table(
-            {
-                robot.name: robot.status if robot.fresh else None
-                for robot in self.subscriber.snapshot.robots
-                if robot.name in self.robots
-            }
-        )
+        setup, snapshot = self.subscriber.setup, self.subscriber.snapshot
+        shown = rows(setup, snapshot, alarms(setup, snapshot))
+        table = fleet_table(row for row in shown if row.robot.name in self.robots)
         return Group(Text(self._title(), "bold"), Text("Ctrl-C holds the fleet", "bold red"), table)

@@ -23,7 +23,7 @@ import base64
 import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 import msgspec
@@ -57,8 +57,17 @@ from foxglove.messages import (
 from edge.core.memory import EXPLORED_CELLS
 from edge.messages.mission import FlightState, GroundState, RobotStatus, explored_from_bytes
 from lpac.analysis.coverage import Coverage
-from lpac.analysis.snapshot import FRESH_S, Explored, FleetSetup, GroundEvent
+from lpac.analysis.snapshot import (
+    FRESH_S,
+    Explored,
+    FleetSetup,
+    FleetSnapshot,
+    GroundEvent,
+    RobotSnapshot,
+)
+from lpac.ground.alarms import alarms
 from lpac.ground.record import Cost
+from lpac.ground.rendering import Row, cell, problem, rows, speed_m_s, state_word
 
 FRAME = "mission"
 FLEET_PERIOD_S = 0.5
@@ -92,15 +101,15 @@ T = TypeVar("T")
 class ShownRobot:
     """A robot's row; of one that was never heard only the name is known.
 
-    `heard_s_ago` is its newest status's age, s, `neighbours` how many it hears, `alarms` their
-    texts; all else is as in `RobotStatus`.
+    `state`, `problem` and `severity` are those of all views, `heard_s_ago` is its newest status's
+    age, s, `neighbours` how many it hears; all else is as in `RobotStatus`.
     """
 
     name: str
+    state: str
+    problem: str
+    severity: str
     heard_s_ago: float | None = None
-    state: str = ""
-    reason: str = ""
-    ready: bool = False
     armed: bool | None = None
     mode: str | None = None
     battery: float | None = None
@@ -108,7 +117,6 @@ class ShownRobot:
     height_m: float | None = None
     speed_m_s: float | None = None
     neighbours: int | None = None
-    alarms: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +223,7 @@ class FoxgloveView:
             texts=[
                 TextPrimitive(
                     pose=label, billboard=True, font_size=_ROBOT_M, color=_WHITE,
-                    text=f"{name} {status.state}",
+                    text=f"{name} {state_word(status)}",
                 )
             ],
         )  # fmt: skip
@@ -248,29 +256,20 @@ class FoxgloveView:
             trial="" if state is None else state.trial,
             safety_action="none" if state is None else state.safety_action,
             seen_share=float(np.mean(self._seen() > 0)),
-            robots=tuple(self._row(name, unix_now_s) for name in setup.robots),
+            robots=tuple(map(_shown_row, self._rows(setup, unix_now_s))),
         )
 
-    def _row(self, name: str, unix_now_s: float) -> ShownRobot:
-        if name not in self._statuses:
-            return ShownRobot(name)
-        heard_at_s, status = self._statuses[name]
-        velocity_m_s = status.velocity_m_s
-        return ShownRobot(
-            name=name,
-            heard_s_ago=max(0.0, unix_now_s - heard_at_s),
-            state=status.state,
-            reason=status.reason.text,
-            ready=status.ready,
-            armed=status.armed,
-            mode=status.mode,
-            battery=status.battery,
-            satellites=status.satellites,
-            height_m=None if status.position_m is None else status.position_m[2],
-            speed_m_s=None if velocity_m_s is None else math.hypot(*velocity_m_s[:2]),
-            neighbours=len(status.neighbour_ages_s),
-            alarms="; ".join(alarm.text for alarm in status.alarms),
+    def _rows(self, setup: FleetSetup, unix_now_s: float) -> list[Row]:
+        heard = (
+            RobotSnapshot(name, robot_id, status, max(0.0, unix_now_s - heard_at_s))
+            if heard_at_s is not None
+            else RobotSnapshot(name, robot_id)
+            for name, robot_id in setup.robots.items()
+            for heard_at_s, status in (self._statuses.get(name, (None, None)),)
         )
+        commander = "" if self._state is None else self._state.operator
+        snapshot = FleetSnapshot(unix_now_s, commander, self._state, tuple(heard))
+        return rows(setup, snapshot, alarms(setup, snapshot))
 
     def _seen(self) -> npt.NDArray[np.uint8]:
         """(EXPLORED_CELLS, EXPLORED_CELLS), indexed [x, y]: how many robots have seen it."""
@@ -330,6 +329,25 @@ def _outline(
         timestamp=Timestamp.from_epoch_secs(unix_time_s), frame_id=FRAME, id=name,
         lifetime=_LIFETIME, lines=[line],
     )  # fmt: skip
+
+
+def _shown_row(row: Row) -> ShownRobot:
+    status = row.robot.status
+    severity = "" if row.alarm is None else row.alarm.severity
+    shown = ShownRobot(row.robot.name, cell(row, "state").text, problem(row).text, severity)
+    if status is None:
+        return shown
+    return replace(
+        shown,
+        heard_s_ago=row.robot.age_s,
+        armed=status.armed,
+        mode=status.mode,
+        battery=status.battery,
+        satellites=status.satellites,
+        height_m=None if status.position_m is None else status.position_m[2],
+        speed_m_s=speed_m_s(status),
+        neighbours=len(status.neighbour_ages_s),
+    )
 
 
 def _yaw_rad(status: RobotStatus) -> float:

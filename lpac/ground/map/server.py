@@ -32,6 +32,7 @@ from lpac.ground.map.view import (
     setup_view,
     snapshot_view,
 )
+from lpac.ground.rendering import rows
 from lpac.ground.station.client import listen, send
 from lpac.ground.station.protocol import (
     CommandReport,
@@ -210,9 +211,9 @@ class LiveMap:
     def _put_detail(self, page: Outbox) -> None:
         if self._snapshot is None or self._setup is None:
             return
-        for robot in self._snapshot.robots:
-            if robot.name == page.selected:
-                page.put(_text(detail_view(self._setup, robot)), "detail")
+        for row in rows(self._setup, self._snapshot, self._alarms):
+            if row.robot.name == page.selected:
+                page.put(_text(detail_view(row, self._snapshot, self._alarms)), "detail")
 
     # Coverage
 

@@ -8,20 +8,36 @@ import base64
 import dataclasses
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 from edge.messages.mission import FlightState, GroundState, RobotStatus
 from lpac.analysis.coverage import Coverage, Whereabouts, in_air
 from lpac.analysis.mission_tracker import MissionTracker
-from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.alarms import Alarm
+from lpac.ground.rendering import (
+    Row,
+    cell,
+    facts,
+    is_ready,
+    not_ready,
+    problem,
+    quantity,
+    rows,
+    state_look,
+    tables,
+)
 from lpac.ground.station.protocol import CommandReport
 
 Json = dict[str, Any]
 
 # What the density is sent with: finer than a laptop shows it.
 DENSITY_CELLS = 256
+# Cells of a robot's row; the style of a robot that is not heard.
+_CELLS = ("height", "battery", "satellites", "link")
+_LOST = "lost"
 # The cost of these counts: a mission may be interrupted, and ends with return or land.
 _IN_MISSION = (FlightState.MISSION, FlightState.HOLD, FlightState.PILOT)
 _MAX_POINTS = 3000
@@ -74,39 +90,39 @@ def snapshot_view(setup: FleetSetup, snapshot: FleetSnapshot, alarms: tuple[Alar
         "buffer": [_rounded(corner) for corner in fence.grown_m(-fence.buffer_m)],
         "running": list(snapshot.running),
         "alarms": [alarm._asdict() for alarm in alarms],
-        "robots": [_robot_view(robot, ground, heading_deg, index) for robot in snapshot.robots],
+        "robots": [
+            _robot_view(row, ground, heading_deg, index) for row in rows(setup, snapshot, alarms)
+        ],
     }
 
 
 def _robot_view(
-    robot: RobotSnapshot,
-    ground: GroundState | None,
-    heading_deg: float | None,
-    index: dict[int, int],
+    row: Row, ground: GroundState | None, heading_deg: float | None, index: dict[int, int]
 ) -> Json:
+    robot, status = row.robot, row.robot.status
     view: Json = {
         "name": robot.name,
         "fresh": robot.fresh,
-        "age_s": _number(robot.age_s, 2),
-        "duplicate": robot.duplicate,
         "enabled": ground is not None and ground.enabled_for(robot.robot_id),
-        "asked": "none" if ground is None else ground.safety_action_for(robot.robot_id),
+        "word": cell(row, "state").text,
+        "look": _LOST,
+        "letter": "?",
+        "problem": problem(row).text,
+        "severity": "" if row.alarm is None else row.alarm.severity,
+        "not_ready": not_ready(row),
+        "cells": {key: quantity(row, key) for key in _CELLS},
     }
-    status = robot.status
     if status is None:
         return view
+    if robot.fresh:
+        view["look"] = "ready" if is_ready(status) else status.state
+        view["letter"] = state_look(status).letter
     return view | {
         "state": status.state,
-        "reason": status.reason.text,
-        "reason_code": status.reason.code,
-        "ready": status.ready,
-        "failed_checks": [check.text for check in status.failed_checks],
         "in_air": in_air(status),
         "position_m": _rounded(status.position_m),
         "yaw_rad": _yaw_rad(status, heading_deg),
         "wanted_m_s": _rounded(status.policy_velocity_m_s),
-        "battery": _number(status.battery, 3),
-        "satellites": status.satellites,
         "landing_m": _rounded(status.landing_point_m),
         # How old each neighbour's last message was then, by the neighbour's place in `robots`.
         "hears": [
@@ -117,16 +133,14 @@ def _robot_view(
     }
 
 
-def detail_view(setup: FleetSetup, robot: RobotSnapshot) -> Json:
-    """Everything about one robot; neighbours by name."""
-    names = {str(robot_id): name for name, robot_id in setup.robots.items()}
-    view: Json = {"kind": "detail", **dataclasses.asdict(robot)}
-    view["rates_hz"] = {names.get(n, n): _number(r, 1) for n, r in robot.rates_hz.items()}
-    if robot.status is not None:
-        status = view["status"]
-        for key in ("neighbour_ages_s", "neighbour_messages"):
-            status[key] = {names.get(n, n): value for n, value in status[key].items()}
-    return cast(Json, _finite(view))
+def detail_view(row: Row, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) -> Json:
+    """Everything about one robot."""
+    return {
+        "kind": "detail",
+        "name": row.robot.name,
+        "facts": facts(row, snapshot, alarms),
+        "tables": [table._asdict() for table in tables(row)],
+    }
 
 
 def report_view(action: str, report: CommandReport) -> Json:
@@ -259,15 +273,6 @@ def _rounded(numbers: tuple[float, ...] | None) -> list[float] | None:
     if numbers is None or not all(map(math.isfinite, numbers)):
         return None
     return [round(number, 2) for number in numbers]
-
-
-def _finite(value: object) -> object:
-    """Without what JSON cannot say: a robot may send anything."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _number(number: float | None, digits: int) -> float | None:

@@ -26,11 +26,11 @@ from edge.messages.mission import FlightState
 from lpac.analysis.mission_tracker import MissionTracker
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent
 from lpac.ground.alarms import Alarm, Before, Severity, alarms, is_flying
+from lpac.ground.rendering import Row, Span, TextStyle, gravest, in_order
 from lpac.ground.station.client import listen, send
 from lpac.ground.station.protocol import Request, Resume, SafetyCommand, ServerMessage, TakeCommand
-from lpac.ground.terminal.lines import Line, Span, TextStyle, line
-from lpac.ground.terminal.robot import detail, in_short
-from lpac.ground.terminal.table import Row, columns, gravest, heading, in_order, table_row
+from lpac.ground.terminal.lines import Line, line
+from lpac.ground.terminal.robots import columns, detail, heading, in_short, table_row
 from lpac.ground.terminal.text import HELP, KEYS, alarm_lines, few_alarms, header, lost, outcome
 
 _CONNECT_AGAIN_S = 0.5

@@ -3,27 +3,13 @@
 Widths are those of a terminal's cells.
 """
 
-import math
 import textwrap
 from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple
 
 from rich.cells import cell_len, set_cell_size
 
 from edge.core.counted import counted
-
-TextStyle = Literal[
-    "", "strong", "faint", "good", "calm", "busy", "foreign", "critical", "warning", "note", "bar",
-    "banner",
-]  # fmt: skip
-
-
-class Span(NamedTuple):
-    """A piece of a line."""
-
-    text: str
-    style: TextStyle = ""
-
+from lpac.ground.rendering import Span
 
 Line = tuple[Span, ...]
 
@@ -62,45 +48,6 @@ def wrapped(width: int, first: Line, text: Span) -> list[Line]:
         line(width, *start, Span(part, text.style))
         for start, part in zip(starts, parts, strict=True)
     ]
-
-
-# Numbers
-
-
-def number(value: float | None, width: int, decimals: int = 1) -> str:
-    """As many decimals as there is room for; "-" for what is not known, ">99" beyond the width."""
-    if value is None or not math.isfinite(value):
-        return "-".rjust(width)
-    for places in range(decimals, -1, -1):
-        # Adding 0 turns -0.0 into 0.0.
-        text = f"{round(value, places) + 0.0:.{places}f}"
-        if len(text) <= width:
-            return text.rjust(width)
-    return ">" + "9" * (width - 1) if value > 0.0 else "<-" + "9" * (width - 2)
-
-
-def direction(heading_deg: float, decimals: int = 0) -> str:
-    """Below 360°, also rounded."""
-    return f"{round(heading_deg, decimals) % 360.0:.{decimals}f}°"
-
-
-def age(value_s: float | None) -> str:
-    """Three characters: seconds, or with a unit minutes or hours."""
-    if value_s is None or not math.isfinite(value_s):
-        return "  -"
-    if value_s < 9.95:
-        return f"{max(value_s, 0.0):.1f}"
-    if value_s < 999.5:
-        return f"{value_s:3.0f}"
-    minutes = value_s / 60.0
-    return f"{minutes:2.0f}m" if minutes < 99.5 else f"{min(minutes / 60.0, 99.0):2.0f}h"
-
-
-def duration(value_s: float) -> str:
-    """Such as 02:05, or 1:02:05."""
-    minutes, seconds = divmod(int(max(value_s, 0.0)), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes:02}:{seconds:02}"
 
 
 def some(names: Sequence[str], width: int) -> str:

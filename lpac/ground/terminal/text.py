@@ -6,19 +6,10 @@ from itertools import accumulate
 from edge.messages.mission import GroundState
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.alarms import Alarm, Severity
+from lpac.ground.rendering import ID, MARKS, Span, direction, duration, fence_size, in_order
 from lpac.ground.station.protocol import CommandReport
-from lpac.ground.terminal.lines import (
-    Line,
-    Span,
-    direction,
-    duration,
-    fit,
-    line,
-    plain,
-    some,
-    wrapped,
-)
-from lpac.ground.terminal.table import ID, MARKS, columns, fence_size, heading, in_order, table_row
+from lpac.ground.terminal.lines import Line, fit, line, plain, some, wrapped
+from lpac.ground.terminal.robots import columns, heading, table_row
 
 _OTHER_KEYS = {
     "l": "land", "r": "resume", "Enter": "robot", "a": "alarms", "?": "help", "q": "quit",

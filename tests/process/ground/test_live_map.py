@@ -484,7 +484,7 @@ def test_a_flight_by_clicks(few: FlownFleet, short_path: Path) -> None:
         page.wait_for_function("() => Number(document.querySelector('#share').textContent) > 0")
         # One robot, from its drawer.
         page.click(r"tr[data-robot=r1] >> text=/^\d+\.\d m$/")
-        page.wait_for_selector("#drawer >> text=landing point")
+        page.wait_for_selector("#drawer >> text=landing")
         page.wait_for_selector("#drawer table td >> text=r0")
         page.click("#drawer [data-robot-do=hold]")
         page.wait_for_selector("#drawer .state >> text=hold")

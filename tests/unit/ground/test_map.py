@@ -10,7 +10,9 @@ from edge.core.address import is_loopback
 from edge.messages.mission import ON_GROUND, FlightState, GroundState
 from lpac.analysis.snapshot import FleetSnapshot
 from lpac.ground.map.access import Access
+from lpac.ground.map.server import _PAGE as PAGE
 from lpac.ground.map.view import Missions, detail_view, setup_view, snapshot_view
+from lpac.ground.rendering import Row
 from tests.unit.ground.snapshots import (
     FENCE,
     LOOP,
@@ -139,11 +141,15 @@ def test_what_the_page_is_told_of_the_fleet() -> None:
         "carol",
     )
     assert (view["fence"][2], max(view["buffer"])) == ([20.0, 20.0], [18.5, 18.5])
-    keys = ("fresh", "enabled", "asked", "in_air", "failed_checks", "hears")
+    keys = ("fresh", "enabled", "look", "in_air", "not_ready", "problem", "hears")
     assert [[robot[key] for key in keys] for robot in view["robots"]] == [
-        [True, True, "land", True, [], [[1, 0.21]]],
-        [False, False, "hold", False, ["GPS sees 3 satellites"], [[0, None]]],
+        [True, True, "mission", True, "mission", "mission started", [[1, 0.21]]],
+        [False, False, "lost", False, "not heard", "GPS sees 3 satellites", [[0, None]]],
     ]
+    assert view["robots"][0]["cells"] == {
+        "height": ("4.0 m", ""), "battery": ("90 %", ""), "satellites": ("14", ""),
+        "link": ("0.1 s", ""),
+    }  # fmt: skip
     yaws_deg = [math.degrees(robot["yaw_rad"]) for robot in view["robots"]]
     assert yaws_deg == pytest.approx([10.0, 20.0], abs=0.1)
     assert [setup_view(setup(2), None)[key] for key in ("side_m", "range_m", "sensor_m")] == [
@@ -164,6 +170,15 @@ def test_who_stands_on_the_ground_leaves_no_path() -> None:
 def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
     late = replace(LOOP, lateness_p99_ms=math.nan)
     broken = status(1, loops={"control": late}, hdop=math.nan)
-    view = detail_view(setup(2), robot(broken))
-    shown = json.loads(json.dumps(view, allow_nan=False))["status"]
-    assert shown["loops"]["control"]["lateness_p99_ms"] is None and shown["hdop"] is None
+    view = detail_view(Row(robot(broken), None, setup(2)), snapshot(), ())
+    shown = json.loads(json.dumps(view, allow_nan=False))
+    _, loops = shown["tables"]
+    assert [cell.strip() for cell in loops["rows"][0][0]][4:] == ["0.2", "-", "3.0"]
+    assert ["GPS", "14 satellites", ""] in shown["facts"]
+
+
+def test_the_page_has_a_colour_for_every_look() -> None:
+    """Of its own it says nothing of a robot."""
+    looks = {"ready", "lost", *FlightState}
+    canvas, css = ((PAGE / name).read_text() for name in ("canvas.js", "map.css"))
+    assert all(f'"{look}"' in canvas and f".chip.{look} " in css for look in looks)

@@ -13,6 +13,7 @@ from edge.messages.codes import Refusal, RefusalCode, texts
 from edge.messages.mission import FlightState, GroundState, OrderResult
 from lpac.analysis.snapshot import RobotSnapshot
 from lpac.ground.alarms import Alarm, AlarmCode, alarms
+from lpac.ground.rendering import MARKS, Row, age, in_order, number
 from lpac.ground.station.protocol import (
     CommandReport,
     Problem,
@@ -20,9 +21,8 @@ from lpac.ground.station.protocol import (
     ResultCode,
     RobotResult,
 )
-from lpac.ground.terminal.lines import Line, age, fit, number, plain, some
-from lpac.ground.terminal.robot import detail, in_short
-from lpac.ground.terminal.table import MARKS, Row, columns, heading, in_order, table_row
+from lpac.ground.terminal.lines import Line, fit, plain, some
+from lpac.ground.terminal.robots import columns, detail, heading, in_short, table_row
 from lpac.ground.terminal.text import KEYS, all_of_it, few_alarms, header, lost, outcome
 from tests.said import checks, reason, reasons
 from tests.unit.ground.snapshots import (

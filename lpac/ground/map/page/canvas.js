@@ -1,6 +1,6 @@
 // The map: the mission frame in metres, x to the right and y up.
 
-import { colour, direction, look, number } from "./dom.js";
+import { colour, direction } from "./dom.js";
 
 const EXPLORED_CELLS = 64;
 // Robots send every 0.4 s, and forget what is older than 0.8 s.
@@ -65,7 +65,6 @@ export class MapCanvas {
     this.paths = new Map();
     this.explored = new Map(); // name -> Uint8Array of 0 and 1, indexed [x, y]
     this.selected = null;
-    this.alarmed = new Map();
     this.view = null; // px per m, and the middle in m
     this.fitted = true;
     this.pending = false;
@@ -117,10 +116,6 @@ export class MapCanvas {
       if (!last || Math.hypot(x - last[0], y - last[1]) >= PATH_STEP_M) path.push([x, y]);
       if (path.length > LONGEST_PATH) path.shift();
       this.paths.set(robot.name, path);
-    }
-    this.alarmed = new Map();
-    for (const alarm of snapshot.alarms) {
-      if (!this.alarmed.has(alarm.robot)) this.alarmed.set(alarm.robot, alarm.severity);
     }
     if (this.fitted && reach !== this.reach) this.fit();
     this.reach = reach;
@@ -554,8 +549,7 @@ export class MapCanvas {
   paintRobot(c, robot) {
     const [x, y] = this.toScreen(robot.position_m);
     const r = this.radius;
-    const { style, letter } = look(robot);
-    const severity = this.alarmed.get(robot.name);
+    const { look, letter, severity } = robot;
     c.save();
     c.translate(x, y);
     if (severity === "critical" || severity === "warning") {
@@ -573,7 +567,7 @@ export class MapCanvas {
       c.stroke();
     }
     c.lineJoin = "round";
-    c.fillStyle = this.ink[style];
+    c.fillStyle = this.ink[look];
     const body = new Path2D();
     if (robot.in_air) body.arc(0, 0, r, 0, 2 * Math.PI);
     else body.roundRect(-r * 0.88, -r * 0.88, r * 1.76, r * 1.76, 3);
@@ -596,7 +590,7 @@ export class MapCanvas {
     }
     c.fill(nose);
     c.fill(body);
-    c.fillStyle = DARK_ON.has(style) ? "#111" : "#fff";
+    c.fillStyle = DARK_ON.has(look) ? "#111" : "#fff";
     c.font = `700 ${Math.round(r * 1.25)}px system-ui, sans-serif`;
     c.textAlign = "center";
     c.textBaseline = "middle";
@@ -606,7 +600,7 @@ export class MapCanvas {
 
   paintName(c, robot) {
     const [x, y] = this.toScreen(robot.position_m);
-    const text = robot.fresh ? robot.name : `${robot.name} ${number(robot.age_s, 0, " s")}`;
+    const text = robot.fresh ? robot.name : `${robot.name} ${robot.cells.link[0]}`;
     c.font = `${robot.name === this.selected ? 700 : 600} 12px system-ui, sans-serif`;
     c.textAlign = "left";
     c.textBaseline = "middle";

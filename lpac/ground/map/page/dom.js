@@ -67,23 +67,3 @@ export function clock(seconds) {
   const whole = Math.max(0, Math.floor(seconds));
   return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;
 }
-
-export const age = (seconds) =>
-  seconds === null || seconds === undefined ? "never"
-    : seconds < 10 ? `${seconds.toFixed(1)} s`
-    : seconds < 100 ? `${seconds.toFixed(0)} s`
-    : `${Math.floor(seconds / 60)} min`;
-
-// The letter that stands for a state beside its colour.
-const LETTERS = {
-  init: "I", idle: "–", preflight: "C", arming: "A", takeoff: "T", hold: "H", mission: "M",
-  return: "R", land: "L", landed: "D", pilot: "P", fault: "F",
-};
-
-// How a robot looks: its state, or what is more important to know.
-export function look(robot) {
-  if (!robot.state) return { name: "never heard", style: "lost", letter: "?" };
-  if (!robot.fresh) return { name: `lost in ${robot.state}`, style: "lost", letter: "?" };
-  if (robot.state === "preflight" && robot.ready) return { name: "ready", style: "ready", letter: "✓" };
-  return { name: robot.state, style: robot.state, letter: LETTERS[robot.state] ?? "?" };
-}

@@ -84,13 +84,13 @@ const take = {
     showHead();
     showAsked();
     showAlarms(message.alarms, pick);
-    showFleet(message.robots, map.alarmed, selected, pick);
+    showFleet(message.robots, selected, pick);
     const robot = message.robots.find(({ name }) => name === selected);
     if (robot) drawer.showSnapshot(robot);
     showLink();
   },
   detail(message) {
-    drawer.show(message, snapshot?.alarms ?? []);
+    drawer.show(message);
   },
   report: showReport,
 };
@@ -164,17 +164,13 @@ function question({ action, robots }) {
   const addressed = all.filter(({ name }) => names.has(name));
   const list = (some) => some.map(({ name }) => name).join(", ");
   if (action === "takeoff") {
-    const ready = addressed.filter(({ ready: is, state, fresh }) => is && fresh && state === "preflight");
-    const others = addressed.filter((robot) => !ready.includes(robot));
-    const why = (robot) => {
-      if (!robot.fresh) return "not heard";
-      return robot.state === "preflight" ? (robot.failed_checks[0] ?? "checking") : robot.state;
-    };
+    const ready = addressed.filter((robot) => !robot.not_ready);
+    const others = addressed.filter((robot) => robot.not_ready);
     return {
       title: `Take off ${ready.length} of ${addressed.length} robots?`,
       lines: [
         ready.length ? `Ready: ${list(ready)}.` : "None is ready.",
-        ...[...groups(others, why)].map(([reason, some]) => `Not ready: ${list(some)}: ${reason}`),
+        ...[...groups(others, (robot) => robot.not_ready)].map(([reason, some]) => `Not ready: ${list(some)}: ${reason}`),
         "Motors start, one robot after another.",
       ],
     };
@@ -259,12 +255,12 @@ function showHead() {
 // The step that usually comes next has the strong colour; every button works at any time.
 function showNext(ours, enabled, action) {
   const fresh = ours.filter((robot) => robot.fresh);
-  const every = (states) => fresh.length > 0 && fresh.every(({ state }) => states.includes(state));
+  const every = (wanted) => fresh.length > 0 && fresh.every(({ look }) => look === wanted);
   let next = null;
   if (action === "hold" && fresh.some((robot) => robot.in_air)) next = "resume";
   else if (enabled < ours.length) next = "enable";
-  else if (every(["preflight"]) && fresh.every(({ ready }) => ready)) next = "takeoff";
-  else if (action === "none" && every(["hold"])) next = "start";
+  else if (every("ready")) next = "takeoff";
+  else if (action === "none" && every("hold")) next = "start";
   for (const button of document.querySelectorAll("#bar .group button")) {
     button.classList.toggle("next", button.dataset.do === next);
   }
@@ -304,7 +300,7 @@ function pick(name) {
   $("#side").classList.toggle("one", name !== null);
   const robot = snapshot?.robots.find((r) => r.name === name);
   if (robot) drawer.showSnapshot(robot);
-  if (snapshot) showFleet(snapshot.robots, map.alarmed, selected, pick);
+  if (snapshot) showFleet(snapshot.robots, selected, pick);
 }
 
 // Theme and layers, remembered by the browser

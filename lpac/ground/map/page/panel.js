@@ -1,38 +1,24 @@
 // The side: fleet list, alarms, events.
 
-import { $, age, look, make, number, setClass, setText, sync } from "./dom.js";
+import { $, make, setClass, setText, sync } from "./dom.js";
 
 const MAX_EVENTS = 200;
+const COLUMNS = ["height", "battery", "satellites", "link"];
 
-export function chip(robot) {
-  return setChip(make("i", "chip"), robot);
+export function chip() {
+  return make("i", "chip");
 }
 
 export function setChip(element, robot) {
-  const { style, letter } = look(robot);
-  setClass(element, `chip ${style} ${robot.in_air ? "air" : "ground"}`);
-  setText(element, letter);
-  return element;
+  setClass(element, `chip ${robot.look} ${robot.in_air ? "air" : "ground"}`);
+  setText(element, robot.letter);
 }
 
-export function battery(share) {
-  return share === null || share === undefined ? "" : share <= 0.15 ? "bad" : share <= 0.3 ? "low" : "";
-}
-
-// What a robot's row says beside its state: what is asked of it, or why it is as it is.
-function remark(robot) {
-  if (robot.duplicate) return "two programs are this robot";
-  if (robot.state === "preflight" && !robot.ready) return robot.failed_checks[0] ?? "";
-  if (robot.asked !== "none" && robot.in_air && robot.asked !== robot.state) return `${robot.asked} is asked`;
-  // The state says as much.
-  return robot.reason_code === "mission_started" ? "" : (robot.reason ?? "");
-}
-
-export function showFleet(robots, alarmed, selected, onPick) {
+export function showFleet(robots, selected, onPick) {
   sync(
     $("#robots tbody"), robots, (robot) => robot.name,
     (robot) => {
-      const row = make("tr", "", make("td", "", make("i", "chip")));
+      const row = make("tr", "", make("td", "", chip()));
       for (const name of ["name", "state", "n", "n", "n", "n"]) row.append(make("td", name));
       row.children[2].append(make("b"), " ", make("small"));
       row.dataset.robot = robot.name;
@@ -44,21 +30,19 @@ export function showFleet(robots, alarmed, selected, onPick) {
       return row;
     },
     (row, robot) => {
-      const severity = alarmed.get(robot.name);
-      setClass(row, [robot.name === selected && "chosen", !robot.fresh && "stale", severity].filter(Boolean).join(" "));
+      setClass(row, [robot.name === selected && "chosen", !robot.fresh && "stale", robot.severity].filter(Boolean).join(" "));
       const cells = row.children;
       setChip(cells[0].firstChild, robot);
       setText(cells[1], robot.name);
-      const state = look(robot).name;
       row.dataset.state = robot.fresh ? robot.state : "lost";
-      setText(cells[2].firstChild, state);
-      setText(cells[2].lastChild, remark(robot));
-      cells[2].title = [state, robot.reason].filter(Boolean).join(": ");
-      setText(cells[3], robot.position_m == null ? "–" : `${number(robot.position_m[2], 1)} m`);
-      setText(cells[4], robot.battery == null ? "–" : `${Math.round(robot.battery * 100)} %`);
-      setClass(cells[4], `n ${battery(robot.battery)}`);
-      setText(cells[5], number(robot.satellites));
-      setText(cells[6], age(robot.age_s));
+      setText(cells[2].firstChild, robot.word);
+      setText(cells[2].lastChild, robot.problem);
+      cells[2].title = [robot.word, robot.problem].filter(Boolean).join(": ");
+      COLUMNS.forEach((column, n) => {
+        const [text, style] = robot.cells[column];
+        setText(cells[3 + n], text);
+        setClass(cells[3 + n], `n ${style}`);
+      });
     },
   );
 }

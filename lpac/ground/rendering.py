@@ -1,0 +1,536 @@
+"""A robot as every view shows it: words, numbers and severities, from its status and its alarms.
+
+Pure. The terminal, the map's page, Foxglove and the simulator's table draw what is here, and have
+no words of their own for a robot. A text is as wide as its column at most.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+from edge.core.counted import counted
+from edge.core.fence import Fence
+from edge.messages.codes import texts
+from edge.messages.mission import ON_GROUND, FlightState, RobotStatus
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
+from lpac.ground.alarms import (
+    BATTERY_LOW,
+    FEATURE_AGE_S,
+    LATE_MS,
+    LIMITS,
+    SEVERITIES,
+    Alarm,
+    AlarmCode,
+    Severity,
+)
+
+TextStyle = Literal[
+    "", "strong", "faint", "good", "calm", "busy", "foreign", "critical", "warning", "note", "bar",
+    "banner",
+]  # fmt: skip
+# Characters of an id that tell it from others.
+ID = 8
+NOT_HEARD = "not heard"
+
+_S = FlightState
+
+
+class Span(NamedTuple):
+    """A piece of text."""
+
+    text: str
+    style: TextStyle = ""
+
+
+class Row(NamedTuple):
+    """A robot, and the gravest of its alarms; without a setup less can be judged."""
+
+    robot: RobotSnapshot
+    alarm: Alarm | None = None
+    setup: FleetSetup | None = None
+
+
+def in_order(
+    setup: FleetSetup,
+    snapshot: FleetSnapshot,
+    alarms: Sequence[Alarm],
+    lasting: Mapping[str, Severity] | None = None,
+) -> list[Row]:
+    """The fleet's robots, those with critical alarms first, then those with warnings.
+
+    `lasting` are robots that are kept up for a while, so that nothing jumps to and fro.
+    """
+    severities = {r: alarm.severity for r, alarm in gravest(alarms).items()} | dict(lasting or {})
+    return sorted(
+        rows(setup, snapshot, alarms),
+        key=lambda row: SEVERITIES.index(severities.get(row.robot.name, "note")),
+    )
+
+
+def rows(setup: FleetSetup, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) -> list[Row]:
+    """The fleet's robots, in its order."""
+    worst = gravest(alarms)
+    return [Row(robot, worst.get(robot.name), setup) for robot in snapshot.robots]
+
+
+def gravest(alarms: Iterable[Alarm]) -> dict[str, Alarm]:
+    """Each robot's gravest alarm; they come in order."""
+    worst: dict[str, Alarm] = {}
+    for alarm in alarms:
+        worst.setdefault(alarm.robot, alarm)
+    return worst
+
+
+# Numbers
+
+
+def number(value: float | None, width: int, decimals: int = 1) -> str:
+    """As many decimals as there is room for; "-" for what is not known, ">99" beyond the width."""
+    if value is None or not math.isfinite(value):
+        return "-".rjust(width)
+    for places in range(decimals, -1, -1):
+        # Adding 0 turns -0.0 into 0.0.
+        text = f"{round(value, places) + 0.0:.{places}f}"
+        if len(text) <= width:
+            return text.rjust(width)
+    return ">" + "9" * (width - 1) if value > 0.0 else "<-" + "9" * (width - 2)
+
+
+def direction(heading_deg: float, decimals: int = 0) -> str:
+    """Below 360°, also rounded."""
+    return f"{round(heading_deg, decimals) % 360.0:.{decimals}f}°"
+
+
+def age(value_s: float | None) -> str:
+    """Three characters: seconds, or with a unit minutes or hours."""
+    if value_s is None or not math.isfinite(value_s):
+        return "  -"
+    if value_s < 9.95:
+        return f"{max(value_s, 0.0):.1f}"
+    if value_s < 999.5:
+        return f"{value_s:3.0f}"
+    minutes = value_s / 60.0
+    return f"{minutes:2.0f}m" if minutes < 99.5 else f"{min(minutes / 60.0, 99.0):2.0f}h"
+
+
+def duration(value_s: float) -> str:
+    """Such as 02:05, or 1:02:05."""
+    minutes, seconds = divmod(int(max(value_s, 0.0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes:02}:{seconds:02}"
+
+
+def _fence_margin_m(row: Row, status: RobotStatus) -> float | None:
+    """How far inside the fence's line, negative outside; of its own fence, if it tells it."""
+    fence = status.fence or (row.setup and row.setup.fence)
+    if not fence or status.position_m is None or not all(map(math.isfinite, status.position_m)):
+        return None
+    return fence.distance_m(*status.position_m[:2])
+
+
+def fence_size(fence: Fence) -> str:
+    """Its extent and its heights, m."""
+    across, along = zip(*fence.vertices_m, strict=True)
+    sides = f"{max(across) - min(across):.0f}x{max(along) - min(along):.0f}"
+    return f"{sides} m, {fence.floor_m:g}-{fence.ceiling_m:g} m high"
+
+
+# State, and why
+
+
+class StateLook(NamedTuple):
+    """The letter and the style that stand for a state."""
+
+    letter: str
+    style: TextStyle
+
+
+_LOOKS = {
+    _S.INIT: StateLook("I", "faint"), _S.IDLE: StateLook("-", "faint"),
+    _S.PREFLIGHT: StateLook("C", ""), _S.ARMING: StateLook("A", "busy"),
+    _S.TAKEOFF: StateLook("T", "busy"), _S.HOLD: StateLook("H", "calm"),
+    _S.MISSION: StateLook("M", "good"), _S.RETURN: StateLook("R", "busy"),
+    _S.LAND: StateLook("L", "busy"), _S.LANDED: StateLook("D", "faint"),
+    _S.PILOT: StateLook("P", "foreign"), _S.FAULT: StateLook("F", "critical"),
+}  # fmt: skip
+_READY = StateLook("✓", "good")
+
+
+def is_ready(status: RobotStatus) -> bool:
+    """Whether it would take off now."""
+    return status.state is _S.PREFLIGHT and status.ready
+
+
+def state_word(status: RobotStatus) -> str:
+    """The robot's state; "ready" is preflight with all checks passed."""
+    return "ready" if is_ready(status) else status.state.value
+
+
+def state_look(status: RobotStatus) -> StateLook:
+    """How its state looks."""
+    return _READY if is_ready(status) else _LOOKS[status.state]
+
+
+def state_and_reason(status: RobotStatus) -> str:
+    """Such as "hold: ground commands hold"."""
+    return f"{status.state}: {status.reason.text}"
+
+
+def missing_checks(status: RobotStatus) -> str:
+    """Checks that keep a robot in preflight from being ready, and what helps."""
+    return texts(status.failed_checks) or "the checks are still running"
+
+
+def problem(row: Row) -> Span:
+    """Text of its gravest alarm; without one, checks that fail, or the reason for its state."""
+    status, alarm = row.robot.status, row.alarm
+    if status is None:
+        return Span("")
+    if alarm is None:
+        failed = status.failed_checks if status.state in ON_GROUND and not status.ready else ()
+        return Span(texts(status.alarms or failed) or status.reason.text)
+    # Its state says that it is not ready.
+    short = alarm.code is AlarmCode.NOT_READY
+    return Span(status.failed_checks[0].text if short else alarm.text, alarm.severity)
+
+
+def not_ready(row: Row) -> str:
+    """Obstacle to its takeoff; "" if there is none."""
+    status = row.robot.status
+    if status is None or not row.robot.fresh:
+        return NOT_HEARD
+    if is_ready(status):
+        return ""
+    return missing_checks(status) if status.state is _S.PREFLIGHT else status.state.value
+
+
+# Columns
+
+MARKS: dict[Severity, str] = {"critical": "!", "warning": "*", "note": "-"}
+
+
+def _mark(row: Row) -> Span:
+    return Span("") if row.alarm is None else Span(MARKS[row.alarm.severity], row.alarm.severity)
+
+
+def _name(row: Row) -> Span:
+    grave = row.alarm is not None and row.alarm.severity != "note"
+    return Span(row.robot.name, row.alarm.severity if row.alarm and grave else "strong")
+
+
+def _link(row: Row) -> Span:
+    if row.robot.status is None:
+        return Span("-", "faint")
+    return Span(age(row.robot.age_s), "" if row.robot.fresh else "critical")
+
+
+def _state(_: Row, status: RobotStatus) -> Span:
+    return Span(state_word(status), state_look(status).style)
+
+
+def _battery(row: Row, status: RobotStatus) -> Span:
+    if status.battery is None:
+        return Span("-")
+    style: TextStyle = "warning" if status.battery <= BATTERY_LOW else ""
+    if row.setup is not None and status.battery <= row.setup.battery_critical:
+        style = "critical"
+    return Span(number(100.0 * status.battery, 3, 0), style)
+
+
+def _satellites(_: Row, status: RobotStatus) -> Span:
+    if status.satellites is None:
+        return Span("-")
+    few = status.satellites < LIMITS.min_satellites
+    return Span(number(status.satellites, 3, 0), "warning" if few else "")
+
+
+def _coordinate(axis: int, width: int) -> "_Cell":
+    def of_status(_: Row, status: RobotStatus) -> Span:
+        return Span(number(status.position_m[axis] if status.position_m else None, width))
+
+    return of_status
+
+
+def speed_m_s(status: RobotStatus) -> float | None:
+    """How fast it is; None if that is not known."""
+    return None if status.velocity_m_s is None else math.hypot(*status.velocity_m_s)
+
+
+def _features(_: Row, status: RobotStatus) -> Span:
+    age_s = status.feature_age_s
+    old = age_s is not None and age_s > FEATURE_AGE_S and status.state in (_S.HOLD, _S.MISSION)
+    return Span(age(age_s), "warning" if old else "")
+
+
+def _oldest(_: Row, status: RobotStatus) -> Span:
+    return Span(age(max(status.neighbour_ages_s.values(), default=None)))
+
+
+def _rate(row: Row, status: RobotStatus) -> Span:
+    rates_hz = [r for robot, r in row.robot.rates_hz.items() if robot in status.neighbour_ages_s]
+    return Span(number(sum(rates_hz) / len(rates_hz) if rates_hz else None, 3))
+
+
+def _lag(_: Row, status: RobotStatus) -> Span:
+    lag_ms = max((loop.lateness_p99_ms for loop in status.loops.values()), default=None)
+    late = lag_ms is not None and lag_ms > LATE_MS
+    # Beyond a second with the unit, as an age has one beyond minutes.
+    if lag_ms is not None and lag_ms >= 999.5:
+        return Span(number(lag_ms / 1000.0, 2, 0) + "s", "warning")
+    return Span(number(lag_ms, 3), "warning" if late else "")
+
+
+def _margin(row: Row, status: RobotStatus) -> Span:
+    margin_m = _fence_margin_m(row, status)
+    return Span(number(margin_m, 5), "critical" if margin_m is not None and margin_m < 0 else "")
+
+
+# Of a robot, whether it was heard or not; of what it said.
+_RobotCell = Callable[[Row], Span]
+_Cell = Callable[[Row, RobotStatus], Span]
+
+
+class Column(NamedTuple):
+    """`top` and `unit` head it; where there is not room for all columns, low ranks stay."""
+
+    key: str
+    rank: int
+    top: str
+    unit: str
+    width: int
+    of: _Cell | None
+    left: bool = False
+
+
+_OF_ROBOT: dict[str, _RobotCell] = {
+    "mark": _mark, "name": _name, "link": _link, "problem": problem,
+}  # fmt: skip
+# Left to right. At 80 columns, one of them for the scroll bar, ranks up to 8 have room: who reads
+# why a robot is as it is sees where it is on the map.
+COLUMNS = (
+    Column("mark", 0, "", "", 1, None, left=True),
+    Column("name", 1, "name", "", 4, None, left=True),
+    Column("state", 2, "state", "", 9, _state, left=True),
+    Column("battery", 5, "bat", "%", 3, _battery),
+    Column("satellites", 8, "GPS", "sat", 3, _satellites),
+    Column("mode", 6, "mode", "", 8, lambda _, s: Span(s.mode or "-"), left=True),
+    Column("x", 9, "x", "m", 5, _coordinate(0, 5)),
+    Column("y", 10, "y", "m", 5, _coordinate(1, 5)),
+    Column("height", 7, "h", "m", 4, _coordinate(2, 4)),
+    Column("speed", 16, "v", "m/s", 3, lambda _, s: Span(number(speed_m_s(s), 3))),
+    Column("features", 11, "feat", "s", 4, _features),
+    Column("neighbours", 12, "neigh", "n", 5, lambda _, s: Span(str(len(s.neighbour_ages_s)))),
+    Column("rate", 14, "", "Hz", 3, _rate),
+    Column("oldest", 13, "", "s", 3, _oldest),
+    Column("lag", 15, "lag", "ms", 3, _lag),
+    Column("link", 3, "link", "s", 4, None),
+    Column("margin", 17, "fence", "m", 5, _margin),
+    Column("bundle", 18, "bundle", "", ID, lambda _, s: Span(s.bundle_id[:ID]), left=True),
+    Column("world", 19, "world", "", ID, lambda _, s: Span(s.world_id[:ID]), left=True),
+    Column("problem", 4, "reason", "", 30, None, left=True),
+)
+COLUMN = {column.key: column for column in COLUMNS}
+
+
+def cell(row: Row, column: str) -> Span:
+    """One of a row's cells. What was said long ago is faint."""
+    text, style = _told(row, column)
+    old = column not in _OF_ROBOT and not row.robot.fresh
+    return Span(text, "faint" if old else style)
+
+
+def quantity(row: Row, column: str) -> Span:
+    """A cell with its unit, where no heading has it, however old it is. Counts have none."""
+    text, style = _told(row, column)
+    text, unit = text.strip(), COLUMN[column].unit
+    counts = unit in ("", "n", "sat")
+    return Span(text if counts or not text[-1:].isdigit() else f"{text} {unit}", style)
+
+
+def _told(row: Row, column: str) -> Span:
+    if column in _OF_ROBOT:
+        return _OF_ROBOT[column](row)
+    status, of = row.robot.status, COLUMN[column].of
+    if status is None or of is None:
+        return Span(NOT_HEARD if column == "state" else "-", "faint")
+    return of(row, status)
+
+
+# All of a robot
+
+
+class Fact(NamedTuple):
+    """Something that is known of a robot; some are of the same name."""
+
+    name: str
+    text: str
+    style: TextStyle = ""
+
+
+def facts(row: Row, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) -> list[Fact]:
+    """All that is known of a robot, but for the `tables`: first what is wrong."""
+    robot, status = row.robot, row.robot.status
+    told = [Fact("alarm", a.text, a.severity) for a in alarms if a.robot == robot.name]
+    if status is None:
+        return [*told, Fact("", "it was never heard", "faint")]
+    told += [Fact("not taken", each.text, "warning") for each in status.not_taken]
+    if status.state in ON_GROUND:
+        told += [Fact("not ready", check.text) for check in status.failed_checks]
+    more = {
+        "vehicle": _vehicle(status),
+        "GPS": _gps(status),
+        "position": _position(status),
+        "landing": _landing(row, status),
+        "policy": _policy(status),
+        "obeys": _obeys(status, snapshot),
+        "orders": "; ".join(
+            "accepted" if order.refusal is None else f"refused: {order.refusal.text}"
+            for order in reversed(status.orders)
+        ),
+        "release": _release(status),
+        "origin": _origin(status),
+        "program": _program(robot, status),
+    }
+    return told + [Fact(name, text) for name, text in more.items() if text]
+
+
+def _vehicle(status: RobotStatus) -> str:
+    armed = {True: "armed", False: "disarmed", None: "armed or not: unknown"}
+    air = {True: "in the air", False: "on the ground", None: ""}
+    return _listed(
+        status.mode or "mode unknown",
+        armed[status.armed],
+        air[status.in_air],
+        "" if status.battery is None else f"battery {status.battery:.0%}",
+        _lasts(status),
+        "" if status.system_id is None else f"system id {status.system_id}",
+    )
+
+
+def _lasts(status: RobotStatus) -> str:
+    if status.battery_lasts_s is None:
+        return ""
+    home = "" if status.home_s is None else f" of which home takes {status.home_s:.0f}"
+    return f"for {status.battery_lasts_s:.0f} s{home}"
+
+
+def _gps(status: RobotStatus) -> str:
+    return _listed(
+        "" if status.satellites is None else counted(status.satellites, "satellite"),
+        "" if status.hdop is None else f"HDOP {status.hdop:.1f}",
+        "" if status.gps_accuracy_m is None else f"accurate to {status.gps_accuracy_m:.1f} m",
+        "" if status.global_deg is None else "at {:.6f} {:.6f}".format(*status.global_deg),
+    )
+
+
+def _position(status: RobotStatus) -> str:
+    where = f"height {status.slot_height_m:g} m when it flies"
+    if status.position_m is not None:
+        x_m, y_m, height_m = status.position_m
+        where = f"x {x_m:.1f}, y {y_m:.1f}, height {height_m:.1f} of {status.slot_height_m:g} m"
+    heading_rad = status.heading_rad
+    return _listed(
+        where,
+        "" if status.position_quality is None else f"position {status.position_quality}",
+        "" if status.velocity_m_s is None else f"{speed_m_s(status):.1f} m/s",
+        "" if heading_rad is None else f"heading {direction(math.degrees(heading_rad))}",
+    )
+
+
+def _listed(*parts: str) -> str:
+    return ", ".join(part for part in parts if part)
+
+
+def _policy(status: RobotStatus) -> str:
+    velocity_m_s, age_s = status.policy_velocity_m_s, status.feature_age_s
+    return _listed(
+        "no answer" if velocity_m_s is None else "asks for {:.2f} {:.2f} m/s".format(*velocity_m_s),
+        "no features" if age_s is None else f"features {age_s:.1f} s old",
+        f"trial {status.trial}" if status.trial else "",
+    )
+
+
+def _landing(row: Row, status: RobotStatus) -> str:
+    x_m, y_m = status.landing_point_m
+    text = f"at x {x_m:.1f} m, y {y_m:.1f} m"
+    if status.position_m is not None:
+        away_m = math.dist(status.position_m[:2], status.landing_point_m)
+        text += f", {away_m:.1f} m away"
+    margin_m = _fence_margin_m(row, status)
+    return text if margin_m is None else f"{text}; fence margin {margin_m:.1f} m"
+
+
+def _obeys(status: RobotStatus, snapshot: FleetSnapshot) -> str:
+    if not status.operator:
+        return "nobody yet"
+    ground = snapshot.ground
+    said = "" if ground is None else f" of {ground.sequence}"
+    safety_action = "" if ground is None else ground.safety_action_for(status.robot_id)
+    asked = f", asked to {safety_action}" if safety_action not in ("", "none") else ""
+    return f"{status.operator}, state {status.obeyed_sequence}{said}{asked}"
+
+
+def _release(status: RobotStatus) -> str:
+    return _listed(
+        f"bundle {status.bundle_id[:ID]}",
+        f"world {status.world_id[:ID]}",
+        "" if status.fence is None else f"fence {fence_size(status.fence)}",
+    )
+
+
+def _origin(status: RobotStatus) -> str:
+    origin = status.origin
+    if origin is None:
+        return ""
+    where = f"{origin.latitude_deg:.7f} {origin.longitude_deg:.7f}"
+    return f"{where} {direction(origin.heading_deg, 1)}"
+
+
+def _program(robot: RobotSnapshot, status: RobotStatus) -> str:
+    offset_s = robot.clock_offset_s
+    clock = "" if offset_s is None else f", clock {offset_s:+.2f} s"
+    return f"up {duration(status.uptime_s)}, start {status.boot_nonce:x}{clock}"
+
+
+class StatusTable(NamedTuple):
+    """A table of a robot's status: headings, the width of each column, and rows in one style."""
+
+    headings: tuple[str, ...]
+    widths: tuple[int, ...]
+    rows: list[tuple[tuple[str, ...], TextStyle]]
+
+
+def tables(row: Row) -> tuple[StatusTable, ...]:
+    """Neighbours: count, rate and age of their messages. Loops: ticks, and lateness in ms.
+
+    Below the neighbours is what became of messages that were not taken; lateness is of the last
+    minute.
+    """
+    status = row.robot.status
+    if status is None:
+        return ()
+    names = {} if row.setup is None else {str(i): name for name, i in row.setup.robots.items()}
+    known = {*status.neighbour_messages, *status.neighbour_ages_s}
+    neighbours: list[tuple[tuple[str, ...], TextStyle]] = []
+    for robot in sorted(known, key=lambda robot: (len(robot), robot)):
+        count = number(status.neighbour_messages.get(robot), 8, 0)
+        rate = number(row.robot.rates_hz.get(robot), 4)
+        cells = names.get(robot, f"robot {robot}"), count, rate
+        heard_s = status.neighbour_ages_s.get(robot)
+        neighbours.append(((*cells, age(heard_s)), "" if heard_s is not None else "faint"))
+    for why, messages in status.message_counts.items():
+        if why != "accepted" and messages:
+            neighbours.append(((why, number(messages, 8, 0)), "faint"))
+    loops: list[tuple[tuple[str, ...], TextStyle]] = []
+    for name, loop in status.loops.items():
+        late_ms = loop.lateness_p50_ms, loop.lateness_p99_ms, loop.lateness_max_ms
+        counts = number(loop.ticks, 7, 0), number(loop.overruns, 6, 0), number(loop.failures, 6, 0)
+        late: TextStyle = "warning" if loop.lateness_p99_ms > LATE_MS else ""
+        loops.append(((name, *counts, *(number(ms, 4) for ms in late_ms)), late))
+    return (
+        StatusTable(("neighbour", "messages", "Hz", "s"), (9, 8, 4, 3), neighbours),
+        StatusTable(
+            ("loop", "ticks", "missed", "failed", "p50", "p99", "max"),
+            (10, 7, 6, 6, 4, 4, 4), loops,
+        ),
+    )  # fmt: skip
