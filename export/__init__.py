@@ -1,1 +1,1 @@
-"""From a torch checkpoint to a bundle (the only user of torch)."""
+"""Export of a torch checkpoint to a bundle. The only package that imports torch."""

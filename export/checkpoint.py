@@ -1,7 +1,7 @@
-"""A trained LPAC network from disk, checked tensor by tensor.
+"""Reads a trained LPAC network from disk and checks every tensor.
 
-Two sources: the state dict of CoverageControl's LPAC module, and the folder of one file per tensor
-in which the paper's authors published their graph neural network and action network.
+Two sources: a state dict of CoverageControl's LPAC module, and a folder with one file per tensor,
+the form in which the paper's authors published their graph neural network and action network.
 """
 
 import hashlib
@@ -23,20 +23,20 @@ from edge.core.aggregation import Geometry
 from edge.core.file_errors import in_words
 from edge.policy.lpac.images import MAP_CHANNELS
 
-# What a state dict does not hold: torch's default for batch norms, and CoverageControl's slope.
+# Not stored in a state dict: torch's default for batch norms, and CoverageControl's slope.
 BATCH_NORM_EPS = 1e-5
 LEAKY_RELU_SLOPE = 0.01
 
 ACTION_SIZE = 2
-# The position that is appended to the CNN's features.
+# The robot's position, appended to the CNN's features.
 POSITION_SIZE = 2
 
-_COMPILED = "_orig_mod."
-_WRAPPED = ("state_dict", "model_state_dict")
+_COMPILED_PREFIX = "_orig_mod."
+_STATE_DICT_KEYS = ("state_dict", "model_state_dict")
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
 _IGNORED_PART = "num_batches_tracked"
 
-# The folder's file names, and the same tensors' names in a state dict.
+# File names in the folder, and the names of the same tensors in a state dict.
 _FOLDER_NAMES = (
     ("lin_{}_{}.pt", "gnn_backbone.graph_conv_{}.lins.{}.weight"),
     ("bias_{}.pt", "gnn_backbone.graph_conv_{}.bias"),
@@ -54,7 +54,7 @@ _FOLDER_NAMES = (
 
 
 class CheckpointError(ValueError):
-    """The checkpoint is not a usable LPAC network; the text names the tensor and says why."""
+    """The checkpoint is not a usable LPAC network. The text names the tensor and the cause."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,7 @@ class Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchNorm:
-    """Four times (features,)."""
+    """weight, bias, mean and variance, each (features,)."""
 
     weight: F32
     bias: F32
@@ -86,7 +86,7 @@ class Convolution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cnn:
-    """Convolutions with batch norm and leaky ReLU, then `linear` with leaky ReLU."""
+    """Convolutions with batch norm and leaky ReLU, then `linear` and a leaky ReLU."""
 
     convolutions: tuple[Convolution, ...]
     linear: Linear
@@ -96,7 +96,7 @@ class Cnn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GnnLayer:
-    """taps (K + 1, F_{l-1}, F_l): the paper's H_lk; bias (F_l,). ReLU follows."""
+    """taps (K + 1, F_{l-1}, F_l), H_lk in the paper; bias (F_l,). A ReLU follows."""
 
     taps: F32
     bias: F32
@@ -104,7 +104,7 @@ class GnnLayer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActionNetwork:
-    """Hidden layers with batch norm and ReLU, then two linear layers with nothing in between.
+    """Hidden layers with batch norm and ReLU, then two linear layers without activation.
 
     The velocity is the output times `std` (2,) plus `mean` (2,), in model units/s.
     """
@@ -120,7 +120,7 @@ class ActionNetwork:
 class Checkpoint:
     """A trained network, all weights float32 and finite. `cnn` is None if the source has none.
 
-    `sha256` is that of the file; of a folder, what `sha256sum *.pt | sha256sum` prints.
+    `sha256` is the file's; for a folder, the output of `sha256sum *.pt | sha256sum`.
     """
 
     geometry: Geometry
@@ -132,7 +132,7 @@ class Checkpoint:
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """Tensors by their names in a state dict; `name` gives back what the source calls them."""
+    """Tensors by their names in a state dict; `name` maps these to the source's own names."""
 
     path: Path
     tensors: Mapping[str, torch.Tensor]
@@ -147,11 +147,11 @@ class _Source:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a state dict's file or a folder of tensors; every size follows from the tensors.
+    """Read a state dict file or a folder of tensors. All sizes follow from the tensors.
 
-    Raises CheckpointError, one line that names the file and the tensor as the source calls it, for
-    a missing, unknown or misshapen tensor, one that is not of finite floating point numbers, and
-    whatever is not an LPAC network at all.
+    Raises CheckpointError, one line with the file and the tensor's name in the source, if a tensor
+    is missing, unknown, misshapen or not of finite floating point numbers, or if the file holds no
+    LPAC network.
     """
     return _checkpoint(
         _read_folder(path) if path.is_dir() else _state_dict(path, _read_bytes(path))
@@ -159,12 +159,12 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def parse_checkpoint(content: bytes, name: str) -> Checkpoint:
-    """As `read_checkpoint`, of a file's content; errors say `name`. Raises CheckpointError."""
+    """Like `read_checkpoint` for a file's content; `name` stands for the file in errors."""
     return _checkpoint(_state_dict(Path(name), content))
 
 
 def checkpoint_tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
-    """The tensors of a state dict's file by their names, checked. Raises CheckpointError."""
+    """Check a state dict file and return its tensors by name. Raises CheckpointError."""
     source = _state_dict(Path(name), content)
     _checkpoint(source)
     return dict(source.tensors)
@@ -178,7 +178,7 @@ def _checkpoint(source: _Source) -> Checkpoint:
 
     layout = _layout(layers, taps, convolutions, mlp_layers)
     sizes = _sizes(layout, source.tensors)
-    weights = _checked(source, layout, sizes)
+    weights = _arrays(source, layout, sizes)
 
     def linear(name: str) -> Linear:
         return Linear(weights[f"{name}.weight"], weights[f"{name}.bias"])
@@ -227,8 +227,8 @@ def _checkpoint(source: _Source) -> Checkpoint:
 def _state_dict(path: Path, content: bytes) -> _Source:
     state = _load(content, path)
     if isinstance(state, dict):
-        # As training programs keep it, beside an optimiser, an epoch and the like.
-        wrapped = [state[key] for key in _WRAPPED if isinstance(state.get(key), dict)]
+        # Training programs often store it beside the optimiser and the epoch.
+        wrapped = [state[key] for key in _STATE_DICT_KEYS if isinstance(state.get(key), dict)]
         state = wrapped[0] if wrapped else state
     if not isinstance(state, dict):
         raise CheckpointError(
@@ -240,19 +240,23 @@ def _state_dict(path: Path, content: bytes) -> _Source:
                 f"{path}: {name}: found a {type(value).__name__}, expected tensors by name: "
                 "save model.state_dict() alone"
             )
-    # torch.compile puts its mark in front of the part that it compiled: of all, or of some.
-    prefix = _COMPILED if all(name.startswith(_COMPILED) for name in state) else ""
-    source_names = {name.replace(_COMPILED, ""): name for name in state}
+    # torch.compile prefixes the names of compiled parts, which may be all or some.
+    prefix = _COMPILED_PREFIX if all(name.startswith(_COMPILED_PREFIX) for name in state) else ""
+    source_names = {name.replace(_COMPILED_PREFIX, ""): name for name in state}
     if len(source_names) < len(state):
-        (twice, _), *_ = Counter(name.replace(_COMPILED, "") for name in state).most_common(1)
-        raise CheckpointError(f"{path}: {twice}: found with and without {_COMPILED}, expected once")
+        (twice, _), *_ = Counter(name.replace(_COMPILED_PREFIX, "") for name in state).most_common(
+            1
+        )
+        raise CheckpointError(
+            f"{path}: {twice}: found with and without {_COMPILED_PREFIX}, expected once"
+        )
     tensors = {name: state[source] for name, source in source_names.items()}
     if not any(name.startswith("gnn_backbone.") for name in tensors):
         inside = [found for name in tensors if (found := re.match(r"(.+\.)gnn_backbone\.", name))]
         if inside:
             raise CheckpointError(
-                f"{path}: its tensors' names begin with {inside[0][1]!r}, as if another module "
-                "held the network: save the state dict of the network alone"
+                f"{path}: the tensors' names begin with {inside[0][1]!r}, so the network was part "
+                "of another module: save the state dict of the network alone"
             )
         raise CheckpointError(
             f"{path}: found {len(state)} tensors ({', '.join([*state][:3])}, ...), expected those "
@@ -310,10 +314,10 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _load(content: bytes, path: Path) -> object:
-    """Load the file, as long as it holds tensors and plain containers."""
+    """Load tensors and plain containers, nothing else."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the error below says all that they would
+            warnings.simplefilter("ignore")  # the error below says the same
             loaded: object = torch.load(io.BytesIO(content), "cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         kind = re.search(r"GLOBAL (\S+)", str(error))
@@ -322,21 +326,21 @@ def _load(content: bytes, path: Path) -> object:
         raise CheckpointError(
             f"{path}: found a pickled {kind[1]}, expected tensors: save model.state_dict() alone"
         ) from None
-    except Exception:  # torch raises many kinds on what it cannot read
+    except Exception:  # torch raises many types for unreadable files
         raise CheckpointError(f"{path}: found no torch file, expected a state dict") from None
     return loaded
 
 
 def _count(source: _Source, pattern: str) -> int:
-    """One more than the highest number that `pattern` finds; a gap then is a missing tensor."""
+    """One more than the highest number matched by `pattern`. A gap shows as a missing tensor."""
     matches = (re.fullmatch(pattern, name, re.ASCII) for name in source.tensors)
     numbers = [int(match[1]) for match in matches if match and len(match[1]) < 9]
-    # Numbers beyond the number of tensors leave a gap below it too.
+    # Numbers beyond the number of tensors also leave a gap below it.
     return min(max(numbers, default=-1) + 1, len(source.tensors))
 
 
 def _count_taps(source: _Source) -> int:
-    """K + 1 as most layers have it, the larger if two are as common, but at least 2."""
+    """K + 1 of most layers (the larger one in a tie), at least 2."""
     matches = (re.fullmatch(r"gnn_backbone\.(\w+)\.lins\..*", name) for name in source.tensors)
     taps_of_layer = Counter(match[1] for match in matches if match)
     layers_with = Counter(taps_of_layer.values())
@@ -348,7 +352,7 @@ _Layout = dict[str, tuple[str | int, ...]]
 
 
 def _layout(layers: int, taps: int, convolutions: int, mlp_layers: int) -> _Layout:
-    """All tensors and their shapes: numbers, names of sizes, or a name plus a number."""
+    """All tensors with their shapes: numbers, names of sizes, or a name plus a number."""
     layout: _Layout = {}
 
     def norm(name: str, size: str) -> None:
@@ -381,7 +385,7 @@ def _layout(layers: int, taps: int, convolutions: int, mlp_layers: int) -> _Layo
 
 
 def _sizes(layout: _Layout, tensors: Mapping[str, torch.Tensor]) -> dict[str, int]:
-    """Each named size as most of its tensors have it, so that the odd one out is the one blamed."""
+    """The value of each named size in most of its tensors, so that errors name the odd one out."""
     votes: dict[str, Counter[int]] = {}
     for name, shape in layout.items():
         if name in tensors and tensors[name].dim() == len(shape):
@@ -393,7 +397,7 @@ def _sizes(layout: _Layout, tensors: Mapping[str, torch.Tensor]) -> dict[str, in
 
 
 def _shape(shape: tuple[str | int, ...], sizes: Mapping[str, int]) -> list[int | None]:
-    """`shape` in numbers; None where no tensor of the right rank tells the number."""
+    """`shape` in numbers; None where no tensor of the right rank gives the number."""
     numbers: list[int | None] = []
     for size in shape:
         if isinstance(size, int):
@@ -404,16 +408,15 @@ def _shape(shape: tuple[str | int, ...], sizes: Mapping[str, int]) -> list[int |
     return numbers
 
 
-def _checked(source: _Source, layout: _Layout, sizes: Mapping[str, int]) -> dict[str, F32]:
-    """All tensors of the layout as float32 arrays."""
+def _arrays(source: _Source, layout: _Layout, sizes: Mapping[str, int]) -> dict[str, F32]:
     shapes = {name: _shape(shape, sizes) for name, shape in layout.items()}
     for name, shape in shapes.items():
         if name not in source.tensors:
-            raise source.error(name, "no such tensor", f"one of shape {_text(shape)}")
+            raise source.error(name, "no such tensor", f"one of shape {_shape_text(shape)}")
     norms = {name.rpartition(".")[0] for name in layout if name.endswith("running_var")}
     ignored = {f"{norm}.{_IGNORED_PART}" for norm in norms}
     for name in sorted(source.tensors.keys() - layout.keys() - ignored):
-        found = f"a tensor of shape {_text(source.tensors[name].shape)}"
+        found = f"a tensor of shape {_shape_text(source.tensors[name].shape)}"
         raise source.error(name, found, "no tensor of that name in this LPAC network")
     return {name: _array(source, name, shape) for name, shape in shapes.items()}
 
@@ -424,7 +427,7 @@ def _array(source: _Source, name: str, shape: list[int | None]) -> F32:
         found = f"{tensor.dtype}, {tensor.layout}, on {tensor.device}"
         raise source.error(name, found, "dense floating point numbers")
     if list(tensor.shape) != shape or 0 in shape:
-        raise source.error(name, f"shape {_text(tensor.shape)}", _text(shape))
+        raise source.error(name, f"shape {_shape_text(tensor.shape)}", _shape_text(shape))
     array: F32 = tensor.to(torch.float32).contiguous().numpy()
     if not np.isfinite(array).all():
         found = "NaN" if np.isnan(array).any() else "infinity (in float32)"
@@ -434,7 +437,7 @@ def _array(source: _Source, name: str, shape: list[int | None]) -> F32:
     return array
 
 
-def _text(shape: Iterable[int | None]) -> str:
+def _shape_text(shape: Iterable[int | None]) -> str:
     return f"[{', '.join('*' if size is None else str(size) for size in shape)}]"
 
 
@@ -448,11 +451,11 @@ def _channels(source: _Source, sizes: Mapping[str, int]) -> int:
 
 
 def _image_size(source: _Source, sizes: Mapping[str, int], convolutions: int) -> int:
-    """Side of the square images: every convolution takes a border of kernel - 1 off them."""
+    """Side of the square input images: each convolution removes a border of kernel - 1."""
     channels = sizes[f"conv{convolutions - 1}"]
     side = math.isqrt(sizes["pixels"] // channels)
     if channels * side**2 != sizes["pixels"]:
         shape = source.tensors["cnn_backbone.linear_1.weight"].shape
         expected = f"[{sizes['features']}, {channels} * n * n] for square images"
-        raise source.error("cnn_backbone.linear_1.weight", f"shape {_text(shape)}", expected)
+        raise source.error("cnn_backbone.linear_1.weight", f"shape {_shape_text(shape)}", expected)
     return side + convolutions * (sizes["kernel"] - 1)

@@ -1,4 +1,4 @@
-"""From a checkpoint and its parameters to a bundle."""
+"""Exports a checkpoint and its training parameters as a bundle."""
 
 import hashlib
 from collections.abc import Mapping
@@ -25,10 +25,10 @@ from export.checkpoint import POSITION_SIZE, Checkpoint, CheckpointError, read_c
 from export.golden import golden_vectors
 from export.graphs import OPSET, build_graphs
 from export.parameters import PolicyParameters, read_parameters
-from export.training_maps import contradiction
+from export.training_maps import map_mismatch
 
-# Of a robot's greatest speed, the actions of trainings that are known come to 0.3 to 1.5.
-_SLOWEST, _FASTEST = 0.1, 3.0
+# Training actions relative to a robot's maximum speed: 0.3 to 1.5 in all known trainings.
+_MIN_SPEED_RATIO, _MAX_SPEED_RATIO = 0.1, 3.0
 
 
 def export_bundle(
@@ -39,20 +39,18 @@ def export_bundle(
     cnn: Path | None = None,
     force: bool = False,
 ) -> Bundle:
-    """Make the bundle of a checkpoint: a state dict's file, or a folder of one file per tensor.
+    """Make the bundle of a checkpoint: a state dict file, or a folder with one file per tensor.
 
-    `parameters` is our parameter file or a coverage_control_params.toml; unless it is a `force`,
-    neither what the network remembers of its training nor a bundle of it that lies beside it, as
-    `lpac train` leaves them, may contradict it. `name` is the policy's name,
-    by default the checkpoint's. A folder holds no CNN: its bundle is without perception, but for
-    that of the state dict `cnn`, which replaces a CNN that there is.
+    `parameters` is our parameter file or a coverage_control_params.toml. It must agree with the
+    traces that training left in the network, and with the bundle that `lpac train` wrote beside the
+    checkpoint, unless `force` is set. `name` is the policy's name, by default the checkpoint's.
+    `cnn` is a state dict whose CNN replaces the checkpoint's. A folder has no CNN; its bundle has
+    no perception without `cnn`.
 
-    The bundle has passed `verify` on this machine. Raises CheckpointError or ConfigError, one line
-    each.
+    Runs `verify` on the bundle. Raises CheckpointError or ConfigError, one line each.
     """
     network = read_checkpoint(checkpoint)
     trained = read_parameters(parameters)
-    # Hashes are sha256.
     provenance = {
         "checkpoint": checkpoint.name,
         "checkpoint_sha256": network.sha256,
@@ -63,10 +61,10 @@ def export_bundle(
         other = read_checkpoint(cnn)
         network = _with_cnn(network, other, cnn)
         provenance |= {"cnn": cnn.name, "cnn_sha256": other.sha256}
-    if not force and (why := _doubt(checkpoint, network, trained)):
+    if not force and (why := _mismatch(checkpoint, network, trained)):
         raise CheckpointError(
-            f"{parameters}: is hardly what {cnn or checkpoint} was trained with: {why}. "
-            "If it is, --force exports it"
+            f"{parameters}: does not match the training of {cnn or checkpoint}: {why}. "
+            "Use --force to export it all the same"
         )
     try:
         return bundle_of(network, trained, name or checkpoint.stem, provenance)
@@ -74,19 +72,19 @@ def export_bundle(
         raise CheckpointError(f"{checkpoint}: {error}") from None
 
 
-def _doubt(checkpoint: Path, network: Checkpoint, trained: PolicyParameters) -> str | None:
-    """Why these are hardly the parameters that it was trained with; None if they may be."""
+def _mismatch(checkpoint: Path, network: Checkpoint, trained: PolicyParameters) -> str | None:
+    """The reason why the network was not trained with these parameters, if there is one."""
     return (
-        _other_than_beside(checkpoint, network, trained)
-        or _other_speed(network, trained.training.max_speed)
-        or (contradiction(network.cnn, trained.perception) if network.cnn else None)
+        _bundle_mismatch(checkpoint, network, trained)
+        or _speed_mismatch(network, trained.training.max_speed)
+        or (map_mismatch(network.cnn, trained.perception) if network.cnn else None)
     )
 
 
-def _other_than_beside(
+def _bundle_mismatch(
     checkpoint: Path, network: Checkpoint, trained: PolicyParameters
 ) -> str | None:
-    """Describe how a bundle of this checkpoint in the folder of its name differs."""
+    """Differences from the bundle of this checkpoint in the folder of the same name; or None."""
     beside = checkpoint.with_suffix("")
     try:
         manifest = load_bundle(beside).manifest
@@ -95,10 +93,10 @@ def _other_than_beside(
     if manifest.provenance.get("checkpoint_sha256") != network.sha256:
         return None
     perception = manifest.perception
-    if perception is not None:  # This follows from the network.
+    if perception is not None:  # unseen_as_nan follows from the network
         perception = replace(perception, unseen_as_nan=trained.perception.unseen_as_nan)
     differing = [
-        f"{field.name} = {getattr(given, field.name)} (there {getattr(known, field.name)})"
+        f"{field.name} = {getattr(given, field.name)} (in the bundle {getattr(known, field.name)})"
         for given, known in (
             (trained.perception, perception),
             (trained.training, manifest.training),
@@ -108,21 +106,21 @@ def _other_than_beside(
         if getattr(given, field.name) != getattr(known, field.name)
     ]
     return (
-        f"the bundle {beside} of it was made with others: {', '.join(differing)}"
+        f"the bundle {beside} of this checkpoint differs: {', '.join(differing)}"
         if differing
         else None
     )
 
 
-def _other_speed(network: Checkpoint, max_speed: float) -> str | None:
-    """Training's actions were about as fast as robots may fly: some faster, where it overshot."""
+def _speed_mismatch(network: Checkpoint, max_speed: float) -> str | None:
+    """Compare the speed of the training actions with `max_speed`. Some trainings exceed it."""
     mean, std = (np.asarray(of, np.float64) for of in (network.action.mean, network.action.std))
     speed = float(np.sqrt(np.square(mean).sum() + np.square(std).sum()))
-    if _SLOWEST * max_speed < speed < _FASTEST * max_speed:
+    if _MIN_SPEED_RATIO * max_speed < speed < _MAX_SPEED_RATIO * max_speed:
         return None
     return (
-        f"with max_speed = {max_speed:g}, the actions that it was trained with, {speed:.2g} on "
-        f"average (rms), would be {speed / max_speed:.2g} times as fast"
+        f"with max_speed = {max_speed:g}, the mean training action (rms {speed:.2g}) would be "
+        f"{speed / max_speed:.2g} times the maximum speed"
     )
 
 
@@ -141,11 +139,10 @@ def _with_cnn(network: Checkpoint, other: Checkpoint, path: Path) -> Checkpoint:
 def bundle_of(
     network: Checkpoint, trained: PolicyParameters, name: str, provenance: Mapping[str, str]
 ) -> Bundle:
-    """The bundle of a network in memory; it has passed `verify` on this machine.
+    """Make the bundle of a network in memory and run `verify` on it.
 
-    `provenance` says where the network came from; the exporter adds itself. Whether what is unseen
-    is NaN in the local map follows from the network's images, whatever `trained` says. Raises
-    CheckpointError, one line.
+    `provenance` says where the network came from; the exporter's version is added. `unseen_as_nan`
+    follows from the network's images, whatever `trained` has. Raises CheckpointError, one line.
     """
     files = {GOLDEN: golden_vectors(network), **build_graphs(network)}
     images = perception = None
@@ -168,7 +165,7 @@ def bundle_of(
             "exporter": f"lpac-edge {version('lpac-edge')}",
             "torch": torch.__version__,
         },
-        files={},  # make_bundle puts them in
+        files={},  # filled in by make_bundle
         parameters=LpacManifest(OPSET, network.geometry, images).parameters,
     )
     bundle = make_bundle(manifest, files)

@@ -1,10 +1,8 @@
-"""Golden vectors: inputs, and what the torch network makes of them, for a bundle to be held to.
+"""Golden vectors: inputs, and the torch network's outputs, against which a bundle is verified.
 
-Computed in float64 and rounded once, so that what a graph differs from them is its own rounding.
-The inputs are such that every tensor of a graph shows in its outputs, and that the outputs of a
-graph are of one magnitude. An error is measured row by row (first dimension), relative to the row's
-largest golden value but at least a third of the graph's largest: the first makes small biases show,
-the second keeps a row of which little is left by cancellation from being all rounding.
+Outputs are computed in float64 and rounded once, so that a graph's difference is its own rounding.
+Inputs are chosen so that every tensor of a graph affects its outputs, and that all outputs of a
+graph have a similar magnitude. `edge.policy.lpac.verify` defines the error.
 """
 
 import io
@@ -42,16 +40,16 @@ _TOLERANCE = 1e-5
 
 _SEED = 14
 _ROBOTS = 10
-# In the unit square: with this seed the robots have 1 to 6 neighbours and are connected.
+# In the unit square. With this seed, robots have 1 to 6 neighbours and are connected.
 _RANGE = 0.4
 
 
 def golden_vectors(checkpoint: Checkpoint) -> bytes:
-    """An npz, all float32 but for the neighbours: the same bytes for the same checkpoint.
+    """The npz file, deterministic, all arrays float32 except the adjacency.
 
-    `<graph>/input` and `<graph>/output` for each graph's file name; a swarm of N robots, one of
-    which is alone: `swarm/neighbours` (N, N) bool, `swarm/features` (N, F_0), and
-    `swarm/velocities` (K L + 1, N, 2) after 0, 1, .. K L synchronous rounds of exchange.
+    For each graph, `<file name>/input` and `/output`. For a swarm of N robots, one of them without
+    neighbours: `swarm/neighbours` (N, N) bool, `swarm/features` (N, F_0), `swarm/velocities`
+    (K L + 1, N, 2) after 0, 1, .. K L synchronous rounds of exchange.
 
     Raises CheckpointError if the network's outputs are beyond float32.
     """
@@ -59,7 +57,7 @@ def golden_vectors(checkpoint: Checkpoint) -> bytes:
 
     def add(graph: str, inputs: F32, function: Callable[[Tensor], Tensor]) -> None:
         arrays[f"{graph}/input"] = inputs
-        arrays[f"{graph}/output"] = _rounded(graph, function(_exact(inputs)))
+        arrays[f"{graph}/output"] = _float32(graph, function(_float64(inputs)))
 
     if checkpoint.cnn:
         add(CNN, _images(checkpoint.cnn), partial(network.cnn_features, checkpoint.cnn))
@@ -70,15 +68,15 @@ def golden_vectors(checkpoint: Checkpoint) -> bytes:
     neighbours = _neighbours()
     features = _swarm_features(checkpoint)
     shift = network.shift_operator(torch.from_numpy(neighbours))
-    rounds = network.decentralised(checkpoint, shift, _exact(features))
-    whole = network.centralised(checkpoint, shift, _exact(features))
-    # Invariant: on a static graph, K L rounds make the swarm the centralised network.
+    rounds = network.decentralised(checkpoint, shift, _float64(features))
+    whole = network.centralised(checkpoint, shift, _float64(features))
+    # Invariant: on a static graph, the swarm equals the centralised network after K L rounds.
     error, scale = float((rounds[-1] - whole).abs().max()), float(whole.abs().max())
     if not error <= _TOLERANCE * scale:
         raise AssertionError(f"K L rounds differ from the centralised network: {error} of {scale}")
     arrays["swarm/neighbours"] = neighbours
     arrays["swarm/features"] = features
-    arrays["swarm/velocities"] = _rounded("swarm", rounds)
+    arrays["swarm/velocities"] = _float32("swarm", rounds)
 
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # numpy dates all entries to 1980
@@ -89,21 +87,21 @@ def _random() -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(_SEED))
 
 
-def _exact(array: F32) -> Tensor:
+def _float64(array: F32) -> Tensor:
     return torch.from_numpy(array).double()
 
 
-def _rounded(graph: str, values: Tensor) -> F32:
+def _float32(graph: str, values: Tensor) -> F32:
     array: F32 = values.float().numpy()
     if not np.isfinite(array).all():
-        raise CheckpointError(f"{graph}: outputs are beyond float32: are the weights this large?")
+        raise CheckpointError(f"{graph}: outputs overflow float32: check the size of the weights")
     return array
 
 
 def _images(cnn: Cnn) -> F32:
-    """Blank, each channel alone, all channels dense, and four as they are in flight.
+    """Blank, each channel alone, all channels dense, and four as in flight.
 
-    The dense ones are faint, for noise excites the network more than anything in flight.
+    The dense ones are faint: noise excites the network more than any image in flight.
     """
     random = _random()
     shape = (cnn.channels, cnn.image_size, cnn.image_size)
@@ -117,7 +115,7 @@ def _images(cnn: Cnn) -> F32:
 
 
 def _flight_images(cnn: Cnn, count: int, random: np.random.Generator) -> F64:
-    """Important places in what has been seen, some neighbours, the world's corner on one side."""
+    """Important places in the seen area, some neighbours, the world's corner on one side."""
     size = cnn.image_size
     cells = (np.arange(size) + 0.5) / size
     x, y = np.meshgrid(cells, cells, indexing="ij")
@@ -139,7 +137,7 @@ def _flight_images(cnn: Cnn, count: int, random: np.random.Generator) -> F64:
 
 
 def _hops(layer: GnnLayer) -> F32:
-    """Nothing, then each hop alone and all hops together, with both signs."""
+    """Zeros, then each hop alone and all hops together, with both signs."""
     random = _random()
     taps, inputs, outputs = layer.taps.shape
     alone = np.zeros((taps, taps, inputs))
@@ -152,7 +150,7 @@ def _hops(layer: GnnLayer) -> F32:
 
 
 def _features(action: ActionNetwork) -> F32:
-    """Nothing, then random features with both signs."""
+    """Zeros, then random features with both signs."""
     weight, bias = action_layers(action)[0]
     return _balanced(_random().standard_normal((8, weight.shape[1])), weight, bias)
 
@@ -160,8 +158,8 @@ def _features(action: ActionNetwork) -> F32:
 def _balanced(rows: F64, weight: F64, bias: F32 | F64) -> F32:
     """A row of zeros, then each of `rows` (n, in) and its negative: (2 n + 1, in).
 
-    Scaled so that what `weight` (out, in) makes of a row is as large as `bias` (out,): then
-    neither hides the other, however small one of them is.
+    Rows are scaled so that their products with `weight` (out, in) are as large as `bias` (out,),
+    and neither hides the other.
     """
     reach = np.abs(rows @ weight.T).max(axis=1, keepdims=True)
     target = 2 * max(np.abs(bias).max(), 1e-3)
@@ -170,7 +168,7 @@ def _balanced(rows: F64, weight: F64, bias: F32 | F64) -> F32:
 
 
 def _neighbours() -> npt.NDArray[np.bool_]:
-    """Adjacency, (N, N): a random geometric graph, from which the last robot is cut off."""
+    """Adjacency (N, N) of a random geometric graph; the last robot has no neighbours."""
     positions = _random().uniform(0, 1, (_ROBOTS, 2))
     near: npt.NDArray[np.bool_] = np.hypot(*(positions[:, None] - positions[None]).T) < _RANGE
     np.fill_diagonal(near, False)
@@ -179,7 +177,7 @@ def _neighbours() -> npt.NDArray[np.bool_]:
 
 
 def _swarm_features(checkpoint: Checkpoint) -> F32:
-    """x_0 (N, F_0): the CNN's features of images as in flight, if there is one, and positions."""
+    """x_0 (N, F_0): the CNN's features of images as in flight, or random ones, and positions."""
     random = _random()
     if checkpoint.cnn:
         images = _flight_images(checkpoint.cnn, _ROBOTS, random)

@@ -1,8 +1,7 @@
-"""The network as ONNX graphs, written node by node so that they are byte-equal on any machine.
+"""Builds the network's ONNX graphs node by node, byte-identical on any machine.
 
-Batch norms are folded into the layers before them, and the last linear layers together with the
-de-normalisation into one. The arithmetic is float64 without library sums, so that it gives the
-same float32 weights everywhere.
+Batch norms are folded into the layers before them. The last two linear layers and the
+de-normalisation become one. Float64 without library sums gives the same float32 weights everywhere.
 """
 
 import math
@@ -33,7 +32,7 @@ _BATCH = "batch"
 
 
 def build_graphs(checkpoint: Checkpoint) -> dict[str, bytes]:
-    """All graphs of the bundle by file name. Every first dimension is the free `batch`.
+    """All graphs of the bundle by file name. The first dimension is the free `batch`.
 
     cnn.onnx: images (batch, channels, size, size) -> features (batch, F_0 - 2).
     gnn_<l>.onnx: hops (batch, K + 1, F_{l-1}) -> features (batch, F_l).
@@ -61,14 +60,14 @@ def action_layers(action: ActionNetwork) -> list[tuple[F64, F64]]:
 
 
 def _fold(weight: F32, bias: F32, norm: BatchNorm) -> tuple[F64, F64]:
-    """Weight (out, ...) and bias (out,) of the layer that includes the batch norm after it."""
+    """Fold a batch norm into the layer before it: weight (out, ...) and bias (out,)."""
     scale = norm.weight / np.sqrt(norm.variance.astype(np.float64) + BATCH_NORM_EPS)
     folded: F64 = weight * scale.reshape(-1, *[1] * (weight.ndim - 1))
     return folded, (bias.astype(np.float64) - norm.mean) * scale + norm.bias
 
 
 class _Node(NamedTuple):
-    """One operator of a chain: what comes after the chain's value as its inputs, and attributes."""
+    """One operator of a chain; `weights` are the inputs after the chain's value."""
 
     operator: str
     weights: Mapping[str, npt.NDArray[np.floating]] = {}
@@ -112,7 +111,7 @@ def _model(
     outputs: tuple[str, int],
     chain: Sequence[_Node],
 ) -> bytes:
-    """The graph in which every node takes the one before it; the last one's value is the output."""
+    """Build the graph in which each node takes the output of the one before it."""
     nodes, initialisers, value = [], [], inputs[0]
     for number, node in enumerate(chain, 1):
         result = outputs[0] if number == len(chain) else f"{node.operator.lower()}_{number}"

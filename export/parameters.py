@@ -1,4 +1,4 @@
-"""The parameters that a policy was trained with, from our TOML file or CoverageControl's."""
+"""Reads a policy's training parameters from our TOML file or CoverageControl's."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from edge.policy.bundle import Training
 
 @dataclass(frozen=True, slots=True)
 class PolicyMessages(Bounded):
-    """Limits of messages that robots accept: see `Manifest.payload_limit` and `payload_types`."""
+    """Limits of the policy's messages: see `Manifest.payload_limit` and `payload_types`."""
 
     payload_limit: Positive | None = None
     payload_types: tuple[PayloadType, ...] = FLOAT_PAYLOADS
@@ -21,7 +21,7 @@ class PolicyMessages(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class PolicyParameters:
-    """Training parameters of a policy, and limits of its messages: our file's tables."""
+    """Training parameters of a policy and limits of its messages: the tables of our file."""
 
     perception: PerceptionParameters
     training: Training
@@ -29,10 +29,10 @@ class PolicyParameters:
 
 
 def read_parameters(path: Path) -> PolicyParameters:
-    """Read our parameter file, or of a configuration of `lpac train`, which has [network], what it
-    has of that; or a coverage_control_params.toml, which has [Environment.Maps].
+    """Read our parameter file, a configuration of `lpac train`, or a coverage_control_params.toml.
 
-    Raises ConfigError that names the file and the line or key.
+    The second is recognised by its [network], the third by its [Environment.Maps]. Raises
+    ConfigError that names the file and the line or key.
     """
     document = read_toml(path)
     environment = document.get("Environment")
@@ -45,7 +45,7 @@ def read_parameters(path: Path) -> PolicyParameters:
 
 @dataclass(frozen=True, slots=True)
 class _TableReader:
-    """Single values of a TOML document; a missing one or one of another type is a ConfigError."""
+    """Typed access to a TOML document. A missing value or a wrong type raises ConfigError."""
 
     document: Mapping[str, object]
     path: Path
@@ -73,7 +73,7 @@ class _TableReader:
 
 
 def _from_coverage_control(reader: _TableReader) -> dict[str, object]:
-    """CoverageControl's names and units in our file's form."""
+    """Convert CoverageControl's names and units to those of our file."""
     maps, idf, robot = "Environment.Maps", "Environment.IDF", "RobotModel"
     resolution = reader.number(maps, "Resolution")
     if resolution != 1:
@@ -86,7 +86,7 @@ def _from_coverage_control(reader: _TableReader) -> dict[str, object]:
             f"allowed is WorldMapSize = {world_size}"
         )
     norm = reader.number(idf, "Norm")
-    # There it is a fraction of the largest importance, which is the norm.
+    # CoverageControl gives a fraction of the largest importance, which is the norm.
     unknown = 0.0
     if reader.value(idf, "RobotMapUseUnknownImportance", bool):
         unknown = reader.number(idf, "UnknownImportance") * norm

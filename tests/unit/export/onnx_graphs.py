@@ -1,4 +1,4 @@
-"""Runs a graph with onnxruntime, and measures how far its outputs are from others."""
+"""Run a graph with onnxruntime and compare its outputs."""
 
 import numpy as np
 import onnxruntime
@@ -7,7 +7,7 @@ from edge.core import F32
 
 
 def run_graph(content: bytes, inputs: F32) -> F32:
-    """The graph's one output for its one input."""
+    """The output of a graph with one input and one output."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
@@ -17,7 +17,7 @@ def run_graph(content: bytes, inputs: F32) -> F32:
 
 
 def relative_error(output: F32, truth: F32) -> float:
-    """The largest error of a row by the row's largest value, or a third of the largest of all."""
+    """The largest error of a row over the row's largest value or a third of the overall largest."""
     errors, sizes = (
         np.abs(values).reshape(len(truth), -1).max(axis=1) for values in (output - truth, truth)
     )

@@ -14,7 +14,7 @@ import torch
 
 _PACKAGE = "tests_reference_lpac"
 
-# Loaded before any test runs: it tries a socket, and leaves it to the garbage collector.
+# Imported before any test runs: it opens a socket and leaves it to the garbage collector.
 with warnings.catch_warnings(action="ignore", category=ResourceWarning):
     if PathFinder.find_spec("torch_geometric") is not None:
         import_module("torch_geometric")
@@ -24,7 +24,7 @@ with warnings.catch_warnings(action="ignore", category=ResourceWarning):
 def reference_lpac(state: Mapping[str, torch.Tensor], image_size: int) -> torch.nn.Module:
     """`coverage_control.nn.LPAC` with these weights, in evaluation mode; skips if not installed.
 
-    The model's own files alone are imported, under another name: the package around them wants
+    Only the model's own files are imported, under another name: the package around them needs
     torchvision, and other tests import parts of it differently.
     """
     spec = PathFinder.find_spec("coverage_control")

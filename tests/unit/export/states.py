@@ -1,4 +1,4 @@
-"""Random LPAC state dicts of any geometry, with batch norms that have seen data."""
+"""Random LPAC state dicts of any geometry, with trained batch norms."""
 
 import io
 import math
@@ -16,7 +16,7 @@ from export.parameters import read_parameters
 ROOT = Path(__file__).parents[3]
 State = dict[str, torch.Tensor]
 
-# How the paper's authors named the files of their tensors, one each.
+# File names of the paper's authors, one per tensor.
 _AUTHORS_FILES = (
     (r"gnn_backbone\.graph_conv_(\d)\.lins\.(\d)\.weight", r"lin_\1_\2"),
     (r"gnn_backbone\.graph_conv_(\d)\.bias", r"bias_\1"),
@@ -87,7 +87,7 @@ def random_state(
 
 
 def tap_folder(state: State, folder: Path) -> Path:
-    """Write the state's GNN and action network as the paper's authors store theirs."""
+    """Write the state's GNN and action network in the form of the paper's authors."""
     folder.mkdir()
     for name, tensor in state.items():
         if not name.startswith("cnn_backbone."):
@@ -99,7 +99,7 @@ def tap_folder(state: State, folder: Path) -> Path:
 
 
 def random_bundle(**sizes: int) -> Bundle:
-    """The bundle of such a state, with the shipped policy's perception."""
+    """The bundle of a random state, with the shipped policy's perception."""
     content = io.BytesIO()
     torch.save(random_state(**sizes), content)
     parameters = read_parameters(ROOT / "policies" / "lpac_l2_k3_n10_512.toml")

@@ -1,4 +1,4 @@
-"""Reading checkpoints: what is taken, and the one line that says what is wrong with the others."""
+"""Reading checkpoints: accepted forms, and one-line errors for all others."""
 
 import hashlib
 import re
@@ -107,7 +107,7 @@ def test_every_missing_tensor_is_named_with_its_shape(state: State, tmp_path: Pa
             rest = {other: values for other, values in state.items() if other != name}
             text = error_of(rest, tmp_path)
             assert text.startswith(f"{name}: found no such tensor, expected one of shape [")
-            # No other tensor tells the numbers of channels and of pixels.
+            # No other tensor gives the numbers of channels and of pixels.
             if name not in ("cnn_backbone.conv0.weight", "cnn_backbone.linear_1.weight"):
                 assert text.endswith(str(list(tensor.shape))), text
 
@@ -218,8 +218,8 @@ def renamed(name: str, new_name: str) -> Callable[[State], State]:
         ),
         (
             lambda state: {f"module.{name}": tensor for name, tensor in state.items()},
-            "its tensors' names begin with 'module.', as if another module held the network: save "
-            "the state dict of the network alone",
+            "the tensors' names begin with 'module.', so the network was part of another module: "
+            "save the state dict of the network alone",
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""From a checkpoint to a bundle on disk: `lpac export`, and the policy that the project ships."""
+"""From a checkpoint to a bundle on disk: `lpac export`, and the shipped policy."""
 
 import hashlib
 import shutil
@@ -47,11 +47,11 @@ def test_shipped_policy_is_what_its_checkpoint_gives() -> None:
 
 
 def test_a_parameter_file_of_another_world_is_refused_unless_it_is_forced(tmp_path: Path) -> None:
-    """Each shipped network says how much of its maps lay outside the world."""
+    """Each shipped network shows how much of its training maps lay outside the world."""
     text = (POLICIES / f"{NAME}.toml").read_text()
     other = tmp_path / "other.toml"
     other.write_text(text.replace("world_size = 512", "world_size = 1024"))
-    # Without the bundle beside it.
+    # Without the bundle next to it.
     field = shutil.copy(POLICIES / "field" / "field.pt", tmp_path)
     for checkpoint in (POLICIES / f"{NAME}.pt", Path(field)):
         share = outside_share(cnn_of(checkpoint))
@@ -76,8 +76,8 @@ def cnn_of(checkpoint: Path) -> Cnn:
 @pytest.mark.parametrize(
     ("changed", "why"),
     [
-        ("max_speed = 1.0", r"max_speed = 1, the actions .* 3\.6 times as fast"),
-        ("max_speed = 100.0", "max_speed = 100, the actions"),
+        ("max_speed = 1.0", r"max_speed = 1, the mean training action .* 3\.6 times the maximum"),
+        ("max_speed = 100.0", "max_speed = 100, the mean training action"),
     ],
 )
 def test_a_speed_that_its_actions_cannot_have_is_refused(
@@ -93,12 +93,15 @@ def test_a_speed_that_its_actions_cannot_have_is_refused(
 def test_a_bundle_beside_the_checkpoint_knows_what_it_was_trained_with(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError) as caught:
         export_bundle(POLICIES / "field" / "field.pt", POLICIES / f"{NAME}.toml")
-    told = str(caught.value)
-    assert "env_scale = 1.0 (there 16.0)" in told and "shared_map_cell = 0 (there 8)" in told
-    assert "world_size" not in told and "unseen" not in told
-    # What `lpac train` was told is the same.
+    text = str(caught.value)
+    assert (
+        "env_scale = 1.0 (in the bundle 16.0)" in text
+        and "shared_map_cell = 0 (in the bundle 8)" in text
+    )
+    assert "world_size" not in text and "unseen" not in text
+    # The configuration of `lpac train` has the same values.
     export_bundle(POLICIES / "field" / "field.pt", POLICIES / "field" / "config.toml")
-    # Another checkpoint's bundle says nothing.
+    # The bundle of another checkpoint is ignored.
     shutil.copytree(POLICIES / "field" / "field", tmp_path / NAME)
     shutil.copy(POLICIES / f"{NAME}.pt", tmp_path)
     export_bundle(tmp_path / f"{NAME}.pt", POLICIES / f"{NAME}.toml")
@@ -188,7 +191,7 @@ def test_nothing_is_written_when_the_input_is_wrong(tmp_path: Path) -> None:
 
 def test_a_network_that_float32_cannot_compute_is_refused(tmp_path: Path) -> None:
     state = random_state(convolutions=2)
-    # Two equal channels, whose millions cancel each other in exact arithmetic only.
+    # Two equal channels with values in the millions, which cancel only in exact arithmetic.
     for name in state:
         if ".conv1." in name or (".batch_norm1." in name and state[name].dim()):
             state[name][1] = state[name][0]

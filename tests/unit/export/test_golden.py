@@ -1,4 +1,4 @@
-"""The golden vectors: what they hold, and that no weight can change unnoticed by them."""
+"""The golden vectors: their contents, and that every weight affects them."""
 
 import io
 import os
@@ -35,7 +35,7 @@ def random_checkpoint(folder: Path, **sizes: int) -> Checkpoint:
 
 
 def scaled_weights(content: bytes, taps: int) -> Iterator[tuple[str, bytes]]:
-    """The graph with one of its tensors, or one of its taps, times 1.01."""
+    """The graph with one of its tensors or taps times 1.01, for each of them."""
     model = onnx.load_model_from_string(content)
     for tensor in model.graph.initializer:
         original = tensor.raw_data
@@ -71,7 +71,7 @@ def test_every_tensor_of_a_graph_shows(kind: str, tmp_path: Path) -> None:
 
 
 def test_every_tensor_of_the_authors_taps_shows(authors_taps: Path) -> None:
-    # The mean velocity that they published: half a millimetre per second in five metres per second.
+    # The mean velocity that they published is 0.5 mm/s, of 5 m/s.
     published = os.environ.get(AUTHORS_TAPS) == str(authors_taps)
     excepted = [("action.onnx", "bias_1 0")] if published else []
     assert_every_tensor_shows(read_checkpoint(authors_taps), excepted)
@@ -152,5 +152,5 @@ def test_weights_beyond_float32_are_refused(tmp_path: Path) -> None:
     for name in ("actions_std", "output_linear.weight"):
         state[name] *= 1e30
     torch.save(state, tmp_path / "model.pt")
-    with pytest.raises(CheckpointError, match=r"action\.onnx: outputs are beyond float32"):
+    with pytest.raises(CheckpointError, match=r"action\.onnx: outputs overflow float32"):
         golden_vectors(read_checkpoint(tmp_path / "model.pt"))

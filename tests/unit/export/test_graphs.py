@@ -22,7 +22,7 @@ from tests.unit.export.states import State, random_state
 POLICY = ROOT / "policies" / "lpac_l2_k3_n10_512.pt"
 
 TOLERANCE = 1e-5
-# On another processor the sums are rounded in another order: keep this much below the tolerance.
+# Other processors round sums in another order: keep this far below the tolerance.
 MARGIN = 3
 
 GEOMETRIES = [
@@ -43,7 +43,7 @@ def read_state(state: State, tmp_path: Path) -> Checkpoint:
 
 
 def random_swarm(robots: int, checkpoint: Checkpoint) -> tuple[torch.Tensor, ...]:
-    """Neighbours (N, N), images, and positions as the network takes them."""
+    """Neighbours (N, N), images and positions in the network's form."""
     random = np.random.default_rng(robots)
     places = random.uniform(0, 1, (robots, 2))
     near = np.hypot(*(places[:, None] - places[None]).T) < 0.4
@@ -58,7 +58,7 @@ def random_swarm(robots: int, checkpoint: Checkpoint) -> tuple[torch.Tensor, ...
 def run_swarm(
     graphs: dict[str, bytes], checkpoint: Checkpoint, swarm: tuple[torch.Tensor, ...]
 ) -> np.ndarray:
-    """The centralised network by the graphs alone: (N, 2)."""
+    """Velocities (N, 2) of the centralised network, computed by the graphs alone."""
     near, images, positions = swarm
     shift = network.shift_operator(near).numpy()
     values = np.concatenate([run_graph(graphs[CNN], images.numpy()), positions.numpy()], axis=1)

@@ -33,7 +33,7 @@ TimeStep = 0.1
 [Algorithm]
 EpisodeSteps = 2100
 """
-# With all that the shipped policy's authors set; `{size}` is that of the world.
+# All keys that the shipped policy's authors set; `{size}` is the world's.
 AUTHORS_FILE = """
 NumRobots = 1
 [Environment]
@@ -102,7 +102,7 @@ def test_the_shipped_file() -> None:
 
 @pytest.fixture(params=sources(AUTHORS_PARAMETERS))
 def authors_parameters(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A folder of CoverageControl's files, as the paper's authors published theirs."""
+    """A folder of CoverageControl's files, in the form of the paper's authors."""
     if request.param != MADE:
         return Path(request.param)
     for size in (512, 1024):
