@@ -1,1 +1,1 @@
-"""A learned policy on disk: the bundle, its verification and its replay."""
+"""Learned policies on disk: the bundle, its verification and its replay."""

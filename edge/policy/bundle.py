@@ -1,7 +1,7 @@
-"""A policy as a bundle: its files, and a manifest that says what they are and pins every byte.
+"""A policy's bundle: its files, and a manifest with their hashes.
 
-On disk a bundle is a directory, or its archive (an uncompressed zip whose bytes follow from the
-content): `manifest.json`, `bundle.id`, and the files of the policy's family.
+On disk a bundle is a directory or an archive (an uncompressed, deterministic zip) with
+`manifest.json`, `bundle.id`, and the files of the policy's family.
 """
 
 import dataclasses
@@ -19,29 +19,29 @@ from edge.core.perception import PerceptionParameters
 from edge.core.schema import Bounded, ConfigError, Positive, from_mapping
 from edge.core.wire import FLOAT_PAYLOADS, PayloadType
 
-# Of the manifests that this version reads and writes.
+# Version of the manifests that this module reads and writes.
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 BUNDLE_ID = "bundle.id"
-# The family of a manifest that names none: its bundles are older than the key.
+# Family of a manifest without this key, which older bundles do not have.
 LPAC = "lpac"
-# The oldest date that a zip entry can have, so that archives do not depend on the day.
+# The oldest date of a zip entry, so that archives do not depend on the day.
 _ARCHIVE_DATE = (1980, 1, 1, 0, 0, 0)
-# The shipped one has 4 MB. Whoever reads a bundle may not know who made it.
-_MOST_BYTES = 2**25
-_MOST_MANIFEST_BYTES = 2**20
+# The shipped bundle has 4 MB. Limits protect from bundles of unknown origin.
+_MAX_BYTES = 2**25
+_MAX_MANIFEST_BYTES = 2**20
 
 
 class BundleError(ValueError):
-    """The bundle cannot be used; the text says which part and why."""
+    """The bundle cannot be used; the text names the part and the cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class Training(Bounded):
-    """The scales and the world that the policy was trained with.
+    """Scales and world of the policy's training.
 
     Model units are metres here: `max_speed` is in units/s, `time_step` in s. `idf_truncation` is
-    in standard deviations; `idf_norm` is the importance of the most important cell.
+    in standard deviations; `idf_norm` is the largest importance of a cell.
     """
 
     max_speed: Positive
@@ -56,11 +56,11 @@ class Training(Bounded):
 class Manifest(Bounded):
     """The bundle's description.
 
-    `perception` is None in one that no robot can fly. `provenance` says where the bundle came from,
-    in names and hashes that its maker chose. `parameters` are the keys that only the family
-    understands, as JSON has them. Robots take no payload with a number beyond `payload_limit`;
-    None: any that is finite. `payload_types` are those that the policy was judged with, in closed
-    loop: robots send no other.
+    `perception` is None in a bundle that robots cannot fly. `provenance` holds names and hashes of
+    the bundle's sources, chosen by its maker. `parameters` are the keys of the family, in JSON's
+    types. Robots refuse payloads with a number beyond `payload_limit`; None allows any finite one.
+    `payload_types` are the types with which the policy was evaluated in closed loop; robots send no
+    others.
     """
 
     schema: int
@@ -86,7 +86,7 @@ _KEYS = {each.name for each in dataclasses.fields(Manifest)} - {"parameters"}
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """A bundle in memory whose hashes agree. `id` is the manifest's sha256 in hexadecimal."""
+    """A bundle in memory with matching hashes. `id` is the manifest's sha256 in hexadecimal."""
 
     id: str
     manifest: Manifest
@@ -94,7 +94,7 @@ class Bundle:
 
 
 def make_bundle(manifest: Manifest, files: Mapping[str, bytes]) -> Bundle:
-    """Seal a policy's `files`: their hashes are written into the manifest."""
+    """Seal a policy's `files`: write their hashes into the manifest."""
     hashes = {name: _sha256(files[name]) for name in sorted(files)}
     mapping = dataclasses.asdict(dataclasses.replace(manifest, files=hashes))
     mapping |= mapping.pop("parameters")
@@ -115,9 +115,9 @@ def make_bundle(manifest: Manifest, files: Mapping[str, bytes]) -> Bundle:
 
 
 def _manifest(text: bytes, where: str) -> Manifest:
-    """Raises BundleError, one line with `where`."""
-    if len(text) > _MOST_MANIFEST_BYTES:
-        raise BundleError(f"{where} has {len(text)} bytes: more than {_MOST_MANIFEST_BYTES}")
+    """Parse a manifest. Raises BundleError, one line with `where`."""
+    if len(text) > _MAX_MANIFEST_BYTES:
+        raise BundleError(f"{where} has {len(text)} bytes: more than {_MAX_MANIFEST_BYTES}")
     try:
         mapping = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -132,15 +132,15 @@ def _manifest(text: bytes, where: str) -> Manifest:
 
 
 def load_bundle(path: Path | str) -> Bundle:
-    """Read a bundle's directory or archive; raises BundleError that names what is wrong.
+    """Read a bundle's directory or archive. Raises BundleError that names the fault.
 
-    Checked here: the schema, every hash, missing and unknown files. The rest is the family's.
+    Checks the schema, every hash, and missing and unknown files. The family checks the rest.
     """
     path = Path(path)
     files = _read(path)
     for name in (MANIFEST, BUNDLE_ID):
         if name not in files:
-            raise BundleError(f"{path}: {name} is missing; is this a bundle?")
+            raise BundleError(f"{path}: {name} is missing: not a bundle")
     bundle_id = _sha256(files[MANIFEST])
     if files[BUNDLE_ID] != f"{bundle_id}\n".encode():
         raise BundleError(f"{path}: {MANIFEST} does not have the hash that {BUNDLE_ID} states")
@@ -158,24 +158,23 @@ def load_bundle(path: Path | str) -> Bundle:
 def write_bundle(bundle: Bundle, path: Path) -> None:
     """Write the bundle as an archive if `path` ends in .zip, else as a directory.
 
-    Replaces a bundle of that name; raises BundleError if something else is there, or if it cannot
-    be written.
+    Replaces an existing bundle. Raises BundleError if `path` is something else or not writable.
     """
     try:
         _write(bundle, path.resolve())
     except OSError as error:
-        raise BundleError(f"{path}: cannot be written: {in_words(error)}") from None
+        raise BundleError(f"{path}: cannot write the bundle: {in_words(error)}") from None
 
 
 def _write(bundle: Bundle, path: Path) -> None:
     is_archive = path.suffix == ".zip"
-    if path.exists() and (path.is_file() != is_archive or not _holds_a_bundle(path)):
+    if path.exists() and (path.is_file() != is_archive or not _is_replaceable(path)):
         raise BundleError(
-            f"{path}: is there already and is no bundle: choose another name "
+            f"{path}: exists and is not a bundle: choose another name "
             "(an archive's ends in .zip, a directory's does not)"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Built beside its place and moved there, so that no half-written bundle is ever found.
+    # Build it next to the destination, then move: readers never find half a bundle.
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as scratch:
         new = Path(scratch) / "new"
         if is_archive:
@@ -189,8 +188,8 @@ def _write(bundle: Bundle, path: Path) -> None:
         new.replace(path)
 
 
-def _holds_a_bundle(path: Path) -> bool:
-    """Whether there is nothing but a bundle's files, or nothing at all, at `path`."""
+def _is_replaceable(path: Path) -> bool:
+    """Whether `path` holds only a bundle's files, or is an empty folder."""
     try:
         files = _read(path)
         belongs = {MANIFEST, BUNDLE_ID, *_manifest(files[MANIFEST], str(path)).files}
@@ -220,23 +219,23 @@ def _read(path: Path) -> dict[str, bytes]:
     try:
         if path.is_dir():
             if not (path / MANIFEST).is_file():
-                return {}  # perhaps a large folder of something else
+                return {}  # may be a large unrelated folder
             entries = list(path.iterdir())
-            _bound(path, sum(entry.stat().st_size for entry in entries if entry.is_file()))
+            _check_size(path, sum(entry.stat().st_size for entry in entries if entry.is_file()))
             return {entry.name: entry.read_bytes() if entry.is_file() else b"" for entry in entries}
-        _bound(path, path.stat().st_size)
+        _check_size(path, path.stat().st_size)
         content = path.read_bytes()
     except OSError as error:
         raise BundleError(f"{path}: {in_words(error)}") from None
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            _bound(path, sum(info.file_size for info in archive.infolist()))
+            _check_size(path, sum(info.file_size for info in archive.infolist()))
             files = {name: archive.read(name) for name in archive.namelist()}
     except BundleError:
         raise
-    except Exception as error:  # zipfile raises many kinds on damaged input
+    except Exception as error:  # zipfile raises many types for damaged files
         raise BundleError(
-            f"{path}: is neither a bundle directory nor its archive: {error}"
+            f"{path}: is neither a bundle's directory nor its archive: {error}"
         ) from None
     if any(PurePosixPath(name).name == "data.pkl" for name in files):
         raise BundleError(
@@ -244,12 +243,12 @@ def _read(path: Path) -> dict[str, bytes]:
             "makes a bundle of it"
         )
     if _archive(files) != content:
-        raise BundleError(f"{path}: the archive's bytes are not those that its content gives")
+        raise BundleError(f"{path}: its bytes differ from those that `lpac` writes for its content")
     return files
 
 
-def _bound(path: Path, size: int) -> None:
-    if size > _MOST_BYTES:
+def _check_size(path: Path, size: int) -> None:
+    if size > _MAX_BYTES:
         raise BundleError(
-            f"{path}: has {size / 1e6:.0f} MB; a bundle at most {_MOST_BYTES / 1e6:.0f}"
+            f"{path}: has {size / 1e6:.0f} MB; a bundle has at most {_MAX_BYTES / 1e6:.0f}"
         )

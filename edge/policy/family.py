@@ -1,7 +1,8 @@
-"""Interface of a policy family, so that robots can fly its policies.
+"""Interfaces of a policy family.
 
-A bundle's manifest names its family. The family makes a `Policy` of the bundle, which all robots of
-a program share; that gives each robot an `Agent`. `edge.policy.lpac` is the family of the paper.
+A bundle's manifest names its family. The family makes a `Policy` of the bundle, shared by all
+robots of a program; the policy makes an `Agent` for each robot. `edge.policy.lpac` is the paper's
+family.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,32 +15,32 @@ from edge.core import F32, F64
 from edge.core.part import array_problem, in_one_line
 from edge.policy.bundle import Bundle, BundleError, Manifest
 
-# Float32 rounding stays a factor of six below it, on x86-64 and on AArch64.
+# Six times the float32 rounding on x86-64 and on AArch64.
 TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
 class GoldenCheck:
-    """How far one part of a policy is, on this machine, from the bundle's golden outputs."""
+    """Error of one part of a policy on this machine relative to the bundle's golden outputs."""
 
     name: str
     relative_error: float
 
     @property
     def passed(self) -> bool:
-        """Whether the error is within TOLERANCE (a NaN is not)."""
+        """Whether the error is within TOLERANCE; False for NaN."""
         return self.relative_error <= TOLERANCE
 
 
 class Observation(NamedTuple):
-    """A robot's knowledge when it perceives; model units, arrays valid until the next one.
+    """Inputs of a perception step, in model units. Arrays are valid until the next step.
 
-    `position` (2,) is the robot's, or the nearest point of the world to it. `local_map`
-    (local_map_size, local_map_size), indexed [x, y], is the importance around it as far as it was
-    seen, 0 outside the world; `edge.core.perception.window_corner` says which cell is where. Cells
-    that were not seen have the manifest's `unknown_importance`, or are NaN if `unseen_as_nan` is
-    set there. `neighbours` (n, 2) are the positions of the robots in communication range;
-    `velocity` (2,) is the robot's own, in model units/s as a `PolicyStep` has it.
+    `position` (2,) is the robot's, or the nearest point of the world. `local_map` (local_map_size,
+    local_map_size), indexed [x, y], is the importance seen around it, 0 outside the world;
+    `edge.core.perception.window_corner` gives its place in the world. Unseen cells have the
+    manifest's `unknown_importance`, or NaN if `unseen_as_nan` is set. `neighbours` (n, 2) are the
+    positions of the robots in communication range. `velocity` (2,) is the robot's own, in model
+    units/s like that of `PolicyStep`.
     """
 
     position: F64
@@ -49,10 +50,9 @@ class Observation(NamedTuple):
 
 
 class Perceived(NamedTuple):
-    """An agent's result from an observation.
+    """An agent's result of an observation, in new arrays.
 
-    `features` is a new array, of what shape is the agent's matter; `inputs` is what it was computed
-    from, by name, which the flight log keeps.
+    `features` has a shape of the agent's choice; `inputs`, by name, are written to the flight log.
     """
 
     features: F32
@@ -60,9 +60,9 @@ class Perceived(NamedTuple):
 
 
 class PolicyStep(NamedTuple):
-    """An agent's next action and message: new arrays.
+    """An agent's next action and message, in new arrays.
 
-    `velocity` (2,) is in model units/s, `payload` (message_size,) what its neighbours are told.
+    `velocity` (2,) is in model units/s, `payload` (message_size,) is sent to the neighbours.
     """
 
     velocity: F32
@@ -70,29 +70,29 @@ class PolicyStep(NamedTuple):
 
 
 class Agent(Protocol):
-    """One robot under a policy.
+    """One robot's instance of a policy.
 
-    `observe` is called from the perception thread, `step` and `reset` from the policy thread; they
-    share nothing but the features, which are handed on.
+    The perception thread calls `observe`; the policy thread calls `step` and `reset`. They share
+    only the features, which are passed on.
     """
 
     def observe(self, observation: Observation) -> Perceived:
-        """Look. What the robot has seen before is in the observation's map, and nowhere else."""
+        """Compute features. The observation's map is the only memory of what the robot saw."""
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
-        """Decide, by the newest features and the neighbours' newest messages.
+        """Compute an action from the newest features and the neighbours' newest messages.
 
-        `payloads` are of (message_size,), float16 or float32, in the order of the robots' ids;
-        `degree` is how many neighbours the robot has, heard this time or not. A velocity or a
-        payload that is not finite, or of another shape or type, stops the robot.
+        `payloads` are (message_size,), float16 or float32, in the order of the robots' ids.
+        `degree` is the number of neighbours, including those without a message this time. A
+        velocity or payload that is not finite, or has another shape or type, stops the robot.
         """
 
     def reset(self) -> None:
-        """A new mission begins: what `step` remembers of the last one is forgotten."""
+        """Forget the state of `step`: a new mission begins."""
 
 
 def perceived_problem(perceived: object) -> str:
-    """Why what `Agent.observe` gave is not used; "" if nothing is wrong with it."""
+    """Why the result of `Agent.observe` is invalid; "" if it is valid."""
     if not isinstance(perceived, Perceived):
         return f"observe gives a {type(perceived).__name__}: must be a Perceived"
     if not isinstance(perceived.features, np.ndarray):
@@ -101,7 +101,7 @@ def perceived_problem(perceived: object) -> str:
 
 
 def step_problem(step: object, message_size: int) -> str:
-    """Why what `Agent.step` gave is not used; "" if nothing is wrong with it."""
+    """Why the result of `Agent.step` is invalid; "" if it is valid."""
     if not isinstance(step, PolicyStep):
         return f"step gives a {type(step).__name__}: must be a PolicyStep"
     return array_problem("velocity", step.velocity, (2,)) or array_problem(
@@ -110,59 +110,59 @@ def step_problem(step: object, message_size: int) -> str:
 
 
 class Policy(Protocol):
-    """A loaded bundle. Has no state of its own: several threads may use it at once."""
+    """A loaded bundle, without state: safe to call from several threads."""
 
     @property
     def manifest(self) -> Manifest:
-        """The bundle's; its `perception` is what the policy observes."""
+        """The bundle's manifest; its `perception` determines the observations."""
 
     @property
     def bundle_id(self) -> bytes:
-        """The bundle's, 32 bytes."""
+        """The bundle's id, 32 bytes."""
 
     @property
     def message_size(self) -> int:
-        """How many floats a robot tells its neighbours at each step; 0 or more."""
+        """Number of floats in a robot's message; 0 or more."""
 
     def agent(self) -> Agent:
-        """For one robot that has not flown yet. Raises BundleError if no robot can fly this."""
+        """Make a new robot's agent. Raises BundleError if robots cannot fly this bundle."""
 
     def verify(self) -> Iterator[GoldenCheck]:
-        """Compute the bundle's golden outputs again; nothing if it has none.
+        """Compare with the bundle's golden outputs; yields nothing if it has none.
 
-        Raises BundleError if what it says cannot be read.
+        Raises BundleError if they cannot be read.
         """
 
 
 class PolicyFamily(Protocol):
-    """Makes policies."""
+    """Constructor of a family's policies."""
 
     def __call__(self, bundle: Bundle) -> Policy:
-        """Raises BundleError, one line, for a bundle that is not as the family needs it."""
+        """Load the bundle. Raises BundleError, one line, if it does not fit the family."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VerifiedPolicy:
-    """A policy that was tried on this CPU; `problem` is why it does not pass, None if it does."""
+    """A policy after verification on this CPU; `problem` is None if it passed."""
 
     policy: Policy
     problem: str | None
 
 
 def golden_checks(policy: Policy) -> Iterator[GoldenCheck]:
-    """Run the policy's `verify`. Raises BundleError, also for whatever else that raises."""
+    """Run the policy's `verify`. Turns all its exceptions into BundleError."""
     try:
         yield from policy.verify()
     except BundleError:
         raise
-    except Exception as error:  # a family may be anybody's
+    except Exception as error:  # families may come from other packages
         raise BundleError(f"policy: verify: {in_one_line(error)}") from error
 
 
 def verified(policy: Policy) -> VerifiedPolicy:
-    """Try it. Raises BundleError if it has nothing to be tried with that can be read."""
+    """Verify the policy. Raises BundleError if its golden outputs cannot be read."""
     failed = [check.name for check in golden_checks(policy) if not check.passed]
     problem = None
     if failed:
-        problem = f"{', '.join(failed)} of the bundle do not compute its golden outputs here"
+        problem = f"{', '.join(failed)} did not reproduce the bundle's golden outputs here"
     return VerifiedPolicy(policy, problem)

@@ -1,1 +1,1 @@
-"""The policy family of the paper: CNN, aggregated graph neural network, action network."""
+"""The paper's policy family: CNN, aggregated graph neural network, action network."""

@@ -1,4 +1,4 @@
-"""The learned policy as ONNX graphs: the only user of onnxruntime."""
+"""Runs a policy's ONNX graphs. The only module that imports onnxruntime."""
 
 import os
 
@@ -9,16 +9,16 @@ from edge.core.aggregation import HopBuffer
 from edge.policy.bundle import Bundle, BundleError
 from edge.policy.lpac.manifest import ACTION, CNN, LpacManifest, gnn_graph
 
-# onnxruntime writes a telemetry database into the home directory unless told so before its import.
+# Set before the import, or onnxruntime writes a telemetry database into the home directory.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 import onnxruntime as ort
 
 
 class Graphs:
-    """Runs a bundle's graphs. Has no state of its own: several threads may call it at once."""
+    """A bundle's graphs, without state: safe to call from several threads."""
 
     def __init__(self, bundle: Bundle) -> None:
-        """Load the graphs of `bundle`; raises BundleError for a graph that does not fit it."""
+        """Load the graphs. Raises BundleError for a graph that does not fit the manifest."""
         self.manifest = bundle.manifest
         self.bundle_id = bytes.fromhex(bundle.id)
         self.lpac = LpacManifest.of(bundle.manifest)
@@ -39,12 +39,12 @@ class Graphs:
         self._action = _Graph(bundle, ACTION, "features", (sizes[-1],), "velocity", (2,))
 
     def run(self, graph: str, batch: F32) -> F32:
-        """The output of the graph of that file name for a batch of inputs."""
+        """The output of a graph, given by file name, for a batch of inputs."""
         by_name = {g.name: g for g in (self._cnn, *self._layers, self._action) if g}
         return by_name[graph].run(batch)
 
     def image_features(self, images: F32) -> F32:
-        """The CNN's features (n, 32) of n robots' images (n, channels, size, size).
+        """The CNN's features (n, F_0 - 2) of n robots' images (n, channels, size, size).
 
         Raises BundleError if the bundle was exported without perception.
         """
@@ -53,9 +53,9 @@ class Graphs:
         return self._cnn.run(images)
 
     def velocity(self, features: F32, hops: HopBuffer) -> F32:
-        """The actions (n, 2), in model units/s, of n robots with inputs x_i = `features` (n, F_0).
+        """Actions (n, 2), in model units/s, of n robots with inputs x_i = `features` (n, F_0).
 
-        `hops` holds y_kl for k = 1..K; this fills in its y_0l, layer by layer (paper, section
+        `hops` holds y_kl for k = 1..K; y_0l is filled in here, layer by layer (paper, section
         "Decentralized Graph Neural Networks": z_l = sum over k of y_kl H_lk, x_l = ReLU(z_l)).
         """
         for graph, layer in zip(self._layers, hops.layers, strict=True):
@@ -76,20 +76,18 @@ class _Graph:
     ) -> None:
         self.name = name
         options = ort.SessionOptions()
-        # One robot shares its board with the autopilot: no thread pool, nothing that spins.
+        # The board also runs the autopilot: no thread pool, no spinning.
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
-        # It would keep what the largest batch ever took, that of the verification: 4.5 MB for ever.
+        # The arena would keep the memory of the largest batch, that of verification: 4.5 MB.
         options.enable_cpu_mem_arena = False
         try:
             self._session = ort.InferenceSession(
                 bundle.files[name], options, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # onnxruntime's errors have no common base below Exception
-            raise BundleError(
-                f"{name}: is not a graph that onnxruntime can load: {error}"
-            ) from None
-        # It keeps the file, to load it once more on another device: four megabytes of a policy.
+        except Exception as error:  # onnxruntime's exceptions share no base class
+            raise BundleError(f"{name}: onnxruntime cannot load it: {error}") from None
+        # onnxruntime keeps the file's bytes in case of another device: 4 MB for a policy.
         self._session._model_bytes = None
         found = {
             kind: {value.name: tuple(value.shape[1:]) for value in values}
@@ -102,7 +100,7 @@ class _Graph:
         for kind, shapes in expected.items():
             if found[kind] != shapes:
                 raise BundleError(
-                    f"{name}: its {kind} is {found[kind]}; the manifest's geometry needs {shapes}"
+                    f"{name}: the {kind} is {found[kind]}; the manifest's geometry needs {shapes}"
                 )
         self._input, self._outputs = input_name, [output_name]
 

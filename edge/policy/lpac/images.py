@@ -1,11 +1,11 @@
-"""The images that the policy takes, of what a robot has seen.
+"""Input images of the policy.
 
 LPAC paper (arXiv 2401.04855), section "Perception Module": four square images around the robot:
 importance, the neighbours' relative x and y, and obstacles (the outside of the world). Two more,
-which the paper's policies do not have: "explored" tells what is unseen from what is worthless, 1
-where the robot has seen or was told, and 0 elsewhere, also outside the world; "own_cell" is 1 in
-the robot's Voronoi cell among the neighbours, 0 elsewhere. All are indexed [x, y]; one cell of a
-map is one model unit; positions are in model units.
+which the paper's policies do not use: "explored" is 1 in cells of the world that the robot or its
+neighbours have seen, 0 elsewhere, and separates unseen from unimportant; "own_cell" is 1 in the
+robot's Voronoi cell among the neighbours, 0 elsewhere. All are indexed [x, y]. One cell of a map is
+one model unit; positions are in model units.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from edge.core.perception import (
 NEIGHBOURS = ("neighbours_x", "neighbours_y")
 EXPLORED = "explored"
 OWN_CELL = "own_cell"
-# The images by number of channels, two and four in the order in which CoverageControl stacks them.
+# The images by number of channels. Two and four are in CoverageControl's order.
 MAP_CHANNELS: dict[int, tuple[str, ...]] = {
     2: ("importance", "obstacles"),
     4: ("importance", *NEIGHBOURS, "obstacles"),
@@ -35,11 +35,11 @@ MAP_CHANNELS: dict[int, tuple[str, ...]] = {
 class Resize:
     """Bilinear, antialiased resize from `size` to `new_size` cells: A @ x @ A.T for an image x.
 
-    Each row of A (new_size, size) is a triangle as wide as two new cells, cut at the border and
-    summing to one; as torch and torchvision resize.
+    Each row of A (new_size, size) is a triangle two new cells wide, cut at the border and summing
+    to one, as in torch and torchvision.
     """
 
-    # Rows of A that are multiplied together, without the columns that are zero in all of them.
+    # Number of rows of A multiplied together, without the columns that are zero in all of them.
     _BAND = 8
 
     def __init__(self, size: int, new_size: int) -> None:
@@ -66,7 +66,7 @@ class Resize:
         np.matmul(self._half, self._transposed, out=out)
 
     def interval(self, part: slice) -> F64:
-        """Resize the line (size,) that is 1 in `part` and 0 elsewhere to (new_size,)."""
+        """Resize the line (size,) that is 1 in `part` and 0 elsewhere, to (new_size,)."""
         resized: F64 = self._cumulated[part.stop] - self._cumulated[part.start]
         return resized
 
@@ -75,7 +75,7 @@ def neighbour_maps(offsets: F64, communication_range: float, image_size: int) ->
     """The neighbours' relative x and relative y as two images, (2, image_size, image_size).
 
     `offsets` (n, 2) are the neighbours' positions relative to the robot, in model units. An image
-    spans twice the range; values are in units of the range and add up within a cell.
+    spans twice the range. Values are in units of the range, summed within a cell.
     """
     scaled = offsets * (image_size / (2.0 * communication_range)) + (image_size / 2.0 - 0.5)
     cells = np.clip(np.rint(scaled), 0, image_size - 1).astype(np.intp)
@@ -86,10 +86,10 @@ def neighbour_maps(offsets: F64, communication_range: float, image_size: int) ->
 
 
 def own_cell(offsets: F64, local_map_size: float, image_size: int) -> Bools:
-    """Which places of an image are nearest to the robot: (image_size, image_size).
+    """Mask (image_size, image_size) of the places nearer to the robot than to any neighbour.
 
     `offsets` (n, 2) are the neighbours' positions relative to the robot, in model units; the image
-    spans `local_map_size` around it. Nearer to it than to one of them is a half plane.
+    spans `local_map_size` around it.
     """
     places = (np.arange(image_size) + 0.5 - image_size / 2.0) * (local_map_size / image_size)
     along_x, along_y = (
@@ -102,18 +102,18 @@ def own_cell(offsets: F64, local_map_size: float, image_size: int) -> Bools:
 
 
 class PolicyImages:
-    """Makes one robot's images. Not thread-safe: it belongs to the perception thread."""
+    """Computes one robot's images. Not thread-safe: it belongs to the perception thread."""
 
     def __init__(
         self, parameters: PerceptionParameters, channels: Sequence[str], image_size: int
     ) -> None:
-        """`channels` are of `MAP_CHANNELS`; for EXPLORED, `parameters` have `unseen_as_nan`."""
+        """`channels` are of `MAP_CHANNELS`; EXPLORED needs `parameters.unseen_as_nan`."""
         self._parameters = parameters
         self._resize = Resize(parameters.local_map_size, image_size)
         self._images = np.empty((1, len(channels), image_size, image_size), np.float32)
         self._channels = tuple(channels)
         if EXPLORED in channels:
-            # What of the local map is resized: what was seen, and then what is known there.
+            # Input of the resize: the mask of seen cells, then the map with unseen cells filled in.
             self._part = np.empty((parameters.local_map_size,) * 2, np.float32)
 
     def images(self, position: F64, local_map: F32, neighbours: F64) -> F32:
@@ -121,10 +121,10 @@ class PolicyImages:
 
         `position` (2,) is in the world, `local_map` (local_map_size, local_map_size) around it, and
         `neighbours` (n, 2) are the positions of the robots in range. Those outside the world are
-        taken to the nearest point of it, where training kept the robots.
+        moved to the nearest point inside: in training all robots were inside.
         """
         parameters = self._parameters
-        # Views for this call alone: kept, a copy of a robot would be torn from its own images.
+        # Views for this call only: a deep copy of the robot would separate kept views from images.
         image = dict(zip(self._channels, self._images[0], strict=True))
         corner = window_corner(position, parameters.local_map_size)
         _, inside = part_in_world(corner, parameters.local_map_size, parameters.world_size)

@@ -1,4 +1,4 @@
-"""Parts of a bundle's manifest that only this family understands."""
+"""Keys of a bundle's manifest that belong to this family."""
 
 from dataclasses import asdict, dataclass
 from typing import Literal
@@ -36,7 +36,7 @@ class Images(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class LpacManifest:
-    """The network. `images` is None in a bundle without perception."""
+    """Description of the network. `images` is None in a bundle without perception."""
 
     opset: int
     geometry: Geometry
@@ -51,16 +51,16 @@ class LpacManifest:
 
     @classmethod
     def of(cls, manifest: Manifest) -> "LpacManifest":
-        """The part of the manifest that is the family's. Raises BundleError if it is not right."""
+        """Read the family's keys of the manifest. Raises BundleError if they are invalid."""
         where = f"bundle {manifest.name!r}"
         if manifest.family != LPAC:
-            raise BundleError(f"{where}: is of the family {manifest.family!r}, not {LPAC!r}")
+            raise BundleError(f"{where}: its family is {manifest.family!r}, not {LPAC!r}")
         try:
             lpac = from_mapping(cls, manifest.parameters, where)
         except ConfigError as error:
             raise BundleError(str(error)) from None
         if (lpac.images is None) != (manifest.perception is None):
-            raise BundleError(f"{where}: images and perception: both or neither")
+            raise BundleError(f"{where}: images and perception must be given together")
         if lpac.images and manifest.perception:
             explores = EXPLORED in lpac.images.channels
             if manifest.perception.unseen_as_nan != explores:
@@ -78,7 +78,7 @@ class LpacManifest:
 
     @property
     def parameters(self) -> dict[str, object]:
-        """`Manifest.parameters` of it."""
+        """Value of `Manifest.parameters`."""
         return asdict(self)
 
     @property

@@ -1,4 +1,4 @@
-"""A bundle of this family as a policy that robots fly."""
+"""A bundle of this family as a policy for robots."""
 
 from collections.abc import Iterator, Sequence
 
@@ -27,11 +27,11 @@ class LpacPolicy(Graphs):
         return self.geometry.message_size
 
     def agent(self) -> "LpacAgent":
-        """Raises BundleError if the bundle has no perception."""
+        """Make a robot's agent. Raises BundleError if the bundle has no perception."""
         return LpacAgent(self)
 
     def verify(self) -> Iterator[GoldenCheck]:
-        """Graph by graph, then a whole swarm. Raises BundleError."""
+        """Verify each graph, then a whole swarm. Raises BundleError."""
         return verify(self, self._golden)
 
 
@@ -50,22 +50,22 @@ class LpacAgent:
         self._hops = HopBuffer(policy.geometry)
 
     def observe(self, observation: Observation) -> Perceived:
-        """x_i: the CNN's 32 features of the images, and the 2 of the position."""
+        """x_i: the CNN's features of the images, and the 2 of the position."""
         images = self._images.images(*observation[:3])
         position = position_feature(observation.position, self._world_size)
         features = np.concatenate([self._policy.image_features(images)[0], position])
         return Perceived(features, {"images": images.copy(), "position_feature": position})
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
-        """The action of x_i and the neighbours' Y_j, and the robot's own Y_i."""
+        """The action from x_i and the neighbours' Y_j, and the robot's own Y_i."""
         self._hops.diffuse(payloads, degree)
         [velocity] = self._policy.velocity(features[None], self._hops)
         return PolicyStep(velocity, self._hops.message(degree))
 
     def reset(self) -> None:
-        """Each step writes all that it reads."""
+        """Do nothing: no state is kept between steps."""
 
 
 def position_feature(position: F64, world_size: int) -> F32:
-    """(p + W/2) / W, in [0.5, 1.5] for p in the world, as policies were trained."""
+    """(p + W/2) / W, in [0.5, 1.5] for p in the world, as in training."""
     return ((position + world_size / 2.0) / world_size).astype(np.float32)

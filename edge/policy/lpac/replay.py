@@ -1,4 +1,4 @@
-"""Does the policy compute what it computed in flight? From a flight log's messages alone."""
+"""Replay of a flight log: does the policy compute the same outputs again?"""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -17,14 +17,14 @@ _Array = npt.NDArray[Any]
 
 
 class ReplayError(ValueError):
-    """The messages are not those of a flight with this policy; the text says which and why."""
+    """The messages do not belong to a flight with this policy; the text names one and the cause."""
 
 
 @dataclass(slots=True)
 class Comparison:
-    """One output of the policy over all ticks: what was logged, and what is computed now.
+    """One output of the policy over all ticks: logged against computed.
 
-    `largest_difference` is absolute; NaN if one of the two is not a number where they differ.
+    `largest_difference` is absolute; NaN where only one of the two is NaN.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Comparison:
     largest_difference: float = 0.0
 
     def add(self, logged: _Array, computed: _Array) -> None:
-        """Compare one tick's arrays, which have one shape."""
+        """Compare one tick's arrays, of equal shape."""
         self.ticks += 1
         if np.array_equal(logged, computed, equal_nan=True):
             return
@@ -46,15 +46,15 @@ class Comparison:
 def replay(
     policy: LpacPolicy, messages: Iterable[tuple[str, float, Mapping[str, Any]]]
 ) -> tuple[Comparison, Comparison, Comparison]:
-    """Run every tick again from its logged inputs; compares features, velocity and message.
+    """Run every tick again from its logged inputs; compare features, velocity and message.
 
-    `messages` are (topic, Unix time in s, message), of which `perception` (features and inputs of a
-    `Perceived`) and `policy` (the fields of a `PolicyTick`) count. Every tick stands for itself, so
-    that gaps do no harm. Of the message it is the payload that is compared, as it was sent: in
-    float16 or int8 if that was its type.
+    `messages` are (topic, Unix time in s, message). Topics other than `perception` (features and
+    inputs of a `Perceived`) and `policy` (the fields of a `PolicyTick`) are skipped. Each tick is
+    independent, so gaps are harmless. Payloads are compared as sent: in float16 or int8 if that was
+    their type.
 
-    Raises ReplayError that names the tick if one is not of this policy, and BundleError if no robot
-    can fly it.
+    Raises ReplayError that names the tick if a message does not belong to this policy, and
+    BundleError if robots cannot fly it.
     """
     features, velocity, payload = (Comparison(n) for n in ("features", "velocity", "message"))
     hops = HopBuffer(policy.geometry)
@@ -76,10 +76,10 @@ def replay(
 
 
 def _perceive(policy: LpacPolicy, message: Mapping[str, Any]) -> tuple[_Array, _Array]:
-    """The features that were logged, and those of now."""
+    """The logged features, and the computed ones."""
     inputs = policy.lpac.images
     if inputs is None:
-        raise BundleError(f"bundle {policy.manifest.name!r} has no perception: no robot flew it")
+        raise BundleError(f"bundle {policy.manifest.name!r} has no perception: no robot can fly it")
     shape = (1, len(inputs.channels), inputs.size, inputs.size)
     images = _checked("images", message["images"], shape)
     position_feature = _checked("position_feature", message["position_feature"], (2,))
@@ -90,14 +90,14 @@ def _perceive(policy: LpacPolicy, message: Mapping[str, Any]) -> tuple[_Array, _
 def _infer(
     policy: LpacPolicy, hops: HopBuffer, message: Mapping[str, Any]
 ) -> tuple[tuple[_Array, _Array], tuple[_Array, _Array]]:
-    """The velocity that was logged, and that of now; the payload that was sent, and that of now."""
+    """Velocity, logged and computed; payload, sent and computed."""
     geometry = policy.geometry
     features = _checked("features", message["features"], geometry.feature_sizes[:1])
     logged = _checked("velocity", message["velocity"], (2,))
     payloads = [_checked("payloads", p, (geometry.message_size,)) for p in message["payloads"]]
     degree = message["degree"]
     if degree < len(payloads):
-        raise ValueError(f"degree = {degree}: is less than its {len(payloads)} payloads")
+        raise ValueError(f"degree = {degree}: must be at least {len(payloads)}, the payloads")
     sent = _decoded(policy, message["message"])
     hops.diffuse(payloads, degree)
     [velocity] = policy.velocity(features[None], hops)
@@ -123,5 +123,5 @@ def _decoded(policy: LpacPolicy, data: bytes) -> AggregatedMessage:
         shared_side=perception.shared_map_side if perception else 0,
     )
     if isinstance(message, Rejection):
-        raise ValueError(f"message: would be refused: {message}")
+        raise ValueError(f"message would be refused: {message}")
     return message

@@ -1,4 +1,4 @@
-"""Does this machine compute what torch computed? Needs no torch: the bundle holds its outputs."""
+"""Verifies that this machine computes torch's outputs. Needs no torch: the bundle holds them."""
 
 import io
 import zipfile
@@ -15,8 +15,8 @@ from edge.policy.lpac.graphs import Graphs
 from edge.policy.lpac.manifest import GOLDEN
 
 SWARM = "swarm"
-# The shipped policy's have 0.3 MB.
-_MOST_GOLDEN_BYTES = 2**24
+# The shipped policy's unpack to 0.3 MB.
+_MAX_GOLDEN_BYTES = 2**24
 
 
 def verify(graphs: Graphs, golden_file: bytes) -> Iterator[GoldenCheck]:
@@ -27,8 +27,10 @@ def verify(graphs: Graphs, golden_file: bytes) -> Iterator[GoldenCheck]:
     try:
         with zipfile.ZipFile(io.BytesIO(golden_file)) as archive:
             size = sum(info.file_size for info in archive.infolist())
-        if size > _MOST_GOLDEN_BYTES:
-            raise BundleError(f"{GOLDEN}: unpacks to {size} bytes: more than {_MOST_GOLDEN_BYTES}")
+        if size > _MAX_GOLDEN_BYTES:
+            raise BundleError(
+                f"{GOLDEN}: unpacks to {size} bytes; at most {_MAX_GOLDEN_BYTES} are allowed"
+            )
         golden = dict(np.load(io.BytesIO(golden_file), allow_pickle=False))
         for graph in graphs.lpac.graphs:
             output = graphs.run(graph, golden[f"{graph}/input"])
@@ -51,10 +53,10 @@ def verify(graphs: Graphs, golden_file: bytes) -> Iterator[GoldenCheck]:
 def swarm_velocities(
     graphs: Graphs, neighbours: npt.NDArray[np.bool_], features: F32, rounds: int
 ) -> F32:
-    """Velocities (rounds + 1, N, 2) of a swarm after 0, 1, ... synchronous exchanges of messages.
+    """Velocities (rounds + 1, N, 2) of a swarm after 0, 1, .. synchronous exchanges of messages.
 
     `neighbours` (N, N) is the static graph, known to the robots from the start; `features` is
-    (N, F_0). After K L rounds they are those of the centralised network.
+    (N, F_0). After K L rounds they equal those of the centralised network.
     """
     robots = range(len(features))
     buffers = [HopBuffer(graphs.geometry) for _ in robots]
@@ -63,24 +65,24 @@ def swarm_velocities(
     for exchanged in range(rounds + 1):
         for i in robots:
             if payloads:
-                heard = [payloads[j] for j in np.flatnonzero(neighbours[i])]
-                buffers[i].diffuse(heard, degree=len(heard))
+                received = [payloads[j] for j in np.flatnonzero(neighbours[i])]
+                buffers[i].diffuse(received, degree=len(received))
             velocities[exchanged, i] = graphs.velocity(features[i : i + 1], buffers[i])[0]
         payloads = [buffers[i].message(int(neighbours[i].sum())) for i in robots]
     return velocities
 
 
 def _relative_error(output: F32, golden: F32) -> float:
-    """The largest error of a row by the row's largest value, or by a third of the largest of all.
+    """The largest error of a row over the row's largest value or a third of the overall largest.
 
-    By row, so that a weight that shows in a few rows only is seen; not by less than that third,
-    since a velocity whose parts cancel is rounding alone.
+    The row's value shows a weight that affects few rows. The third of the overall value keeps out
+    rows that are mostly rounding because their parts cancel.
     """
     errors, sizes = (
         np.abs(values).reshape(len(golden), -1).max(axis=1)
         for values in (output.astype(np.float64) - golden, golden)
     )
     scales = np.maximum(sizes, sizes.max() / 3.0)
-    with np.errstate(divide="ignore"):  # a network of zeros: any error is infinitely large
+    with np.errstate(divide="ignore"):  # outputs of zero: any error is infinite
         ratios = np.divide(errors, scales, out=np.zeros_like(errors), where=errors != 0.0)
     return float(ratios.max())

@@ -116,7 +116,7 @@ def test_archives_that_unpack_to_gigabytes(tmp_path: Path) -> None:
     path = tmp_path / "bundle.zip"
     path.write_bytes(zip_of("manifest.json", GIGABYTE, zipfile.ZIP_DEFLATED))
     assert path.stat().st_size < 2e6
-    assert "bundle.zip: has 1000 MB; a bundle at most 34" in refused("bundle", "verify", path)
+    assert "bundle.zip: has 1000 MB; a bundle has at most 34" in refused("bundle", "verify", path)
 
 
 def test_a_file_of_gigabytes_is_not_read(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_a_file_of_gigabytes_is_not_read(tmp_path: Path) -> None:
         with (folder / name).open("wb") as file:
             file.truncate(4 * GIGABYTE)
         path = folder / name if name == "bundle.zip" else folder
-        assert "has 4000 MB; a bundle at most 34" in refused("bundle", "verify", path)
+        assert "has 4000 MB; a bundle has at most 34" in refused("bundle", "verify", path)
 
 
 @pytest.mark.parametrize("text", [BRACKETS, b'{"a":' * 100_000, b" " * 10**7])

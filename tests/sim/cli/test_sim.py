@@ -84,7 +84,7 @@ def test_a_bundle_that_is_not_verified_flies_as_a_point_with_a_warning(tmp_path:
     write_bundle(wrong, tmp_path / "wrong")
     told = called("sim", "-n", 1, "--duration", 1, "--bundle", tmp_path / "wrong")
     assert told.returncode == 0
-    assert "wrong: swarm of the bundle do not compute its golden outputs here" in told.stderr
+    assert "wrong: swarm did not reproduce the bundle's golden outputs here" in told.stderr
 
 
 @pytest.mark.slow

@@ -58,7 +58,7 @@ from tests.conftest import SHIPPED
         ),
         (["sim", "--bundle", f"{SHIPPED}.pt"], "is a torch checkpoint; `lpac export"),
         (["sim", "--bundle", "absent"], "absent: there is no such file or folder"),
-        (["bundle", "verify", "README.md"], "neither a bundle directory nor its archive"),
+        (["bundle", "verify", "README.md"], "neither a bundle's directory nor its archive"),
         (["bundle", "info", "tests"], "manifest.json is missing"),
         (["bundle", "benchmark", str(SHIPPED), "--neighbours", "-1"], "must be from 0 to 1000"),
         (["export", "absent.pt", "--params", f"{SHIPPED}.toml", "-o", "x"], "absent.pt"),

@@ -1,4 +1,4 @@
-"""A bundle that is not, bit for bit, what was exported is refused, and the fault is named."""
+"""A bundle that differs in any bit from the exported one is refused, and the fault is named."""
 
 import dataclasses
 import hashlib
@@ -100,7 +100,7 @@ def test_one_flipped_bit_anywhere_in_the_archive_is_found(
     data: st.DataObject, archive: Path
 ) -> None:
     content = bytearray(archive.read_bytes())
-    # The zip's own structure is at the end and between the files: look there more often.
+    # The zip's own structure is at the end and between the files: test there more often.
     size = len(content)
     place = data.draw(st.one_of(st.integers(0, size - 1), st.integers(size - 700, size - 1)))
     content[place] ^= 1 << data.draw(st.integers(0, 7))
@@ -111,7 +111,7 @@ def test_one_flipped_bit_anywhere_in_the_archive_is_found(
 
 
 def scaled(graph: bytes, tensor: str, part: slice) -> bytes:
-    """The graph with some rows of one of its weights times 1.01."""
+    """The graph with some rows of one weight times 1.01."""
     model = onnx.load_from_string(graph)
     (weight,) = (w for w in model.graph.initializer if w.name == tensor)
     values = numpy_helper.to_array(weight).copy()
@@ -122,7 +122,7 @@ def scaled(graph: bytes, tensor: str, part: slice) -> bytes:
 
 
 def weights(bundle: Bundle) -> list[tuple[str, str, slice]]:
-    """Graph, tensor and rows: every weight and bias of every graph, the taps one by one."""
+    """Graph, tensor and rows of every weight and bias of every graph, the taps one by one."""
     found = []
     for name in GRAPHS:
         for weight in onnx.load_from_string(bundle.files[name]).graph.initializer:
@@ -155,12 +155,12 @@ def test_a_graph_that_does_not_fit_the_manifest_is_named(shipped_bundle: Bundle)
     swapped = make_bundle(
         shipped_bundle.manifest, with_files(shipped_bundle, **{"gnn_2.onnx": gnn_1})
     )
-    with pytest.raises(BundleError, match=r"gnn_2\.onnx: its input is .*34.*256"):
+    with pytest.raises(BundleError, match=r"gnn_2\.onnx: the input is .*34.*256"):
         LpacPolicy(swapped)
     broken = make_bundle(
         shipped_bundle.manifest, with_files(shipped_bundle, **{"gnn_2.onnx": gnn_1[:1000]})
     )
-    with pytest.raises(BundleError, match=r"gnn_2\.onnx: is not a graph"):
+    with pytest.raises(BundleError, match=r"gnn_2\.onnx: onnxruntime cannot load it"):
         LpacPolicy(broken)
 
 
@@ -172,7 +172,7 @@ def test_unreadable_golden_vectors_are_named(shipped_bundle: Bundle, golden: byt
 
 
 def resealed(bundle: Bundle, folder: Path, change: dict[str, object]) -> Path:
-    """The bundle on disk with a changed manifest and the id that goes with it."""
+    """Write the bundle with a changed manifest and its new id."""
     manifest = json.loads(bundle.files[MANIFEST])
     manifest.update(change)
     write_bundle(bundle, folder)
@@ -190,12 +190,12 @@ def resealed(bundle: Bundle, folder: Path, change: dict[str, object]) -> Path:
         ({"colour": "red"}, "unknown key 'colour'; known are opset, geometry, images"),
         ({"geometry": {"hops": 0, "feature_sizes": [34, 256]}}, "hops = 0: must be at least 1"),
         ({"geometry": {"hops": 3}}, "geometry: feature_sizes is missing"),
-        ({"images": None}, "images and perception: both or neither"),
+        ({"images": None}, "images and perception must be given together"),
         ({"training": {"max_speed": -5.0, "time_step": 0.2}}, "max_speed = -5.0: must be above 0"),
         ({"files": {}}, "action.onnx does not belong to the bundle"),
         ({"payload_types": ["int4"]}, "payload_types[0] = 'int4': allowed are 'float32'"),
         ({"opset": 20.5}, "opset = 20.5: must be a whole number"),
-        ({"family": "other"}, "is of the family 'other', not 'lpac'"),
+        ({"family": "other"}, "its family is 'other', not 'lpac'"),
     ],
 )
 def test_an_impossible_manifest_is_named(
@@ -233,8 +233,8 @@ def test_what_is_no_bundle_is_said_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "text.zip").write_text("hello")
     for name, text in (
         ("absent", "there is no such file"),
-        ("empty", "manifest.json is missing; is this a bundle?"),
-        ("text.zip", "neither a bundle directory nor its archive"),
+        ("empty", "manifest.json is missing: not a bundle"),
+        ("text.zip", "neither a bundle's directory nor its archive"),
     ):
         with pytest.raises(BundleError, match=text):
             load_bundle(tmp_path / name)
@@ -247,10 +247,10 @@ def test_writing_never_destroys_something_else(shipped_bundle: Bundle, tmp_path:
     for path in (home, home / "thesis.tex"):
         with pytest.raises(BundleError, match=str(path)):
             write_bundle(shipped_bundle, path)
-    (home / "manifest.json").write_text("{}")  # as a web page has one
+    (home / "manifest.json").write_text("{}")  # web pages have one too
     (tmp_path / "photos.zip").write_bytes(b"PK")
     for path in (home, tmp_path / "photos.zip"):
-        with pytest.raises(BundleError, match="is there already and is no bundle"):
+        with pytest.raises(BundleError, match="exists and is not a bundle"):
             write_bundle(shipped_bundle, path)
     assert (home / "thesis.tex").read_text() == "years of work"
     assert (tmp_path / "photos.zip").read_bytes() == b"PK"

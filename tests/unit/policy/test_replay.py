@@ -1,4 +1,4 @@
-"""What real robots computed is computed again, and whatever was altered shows."""
+"""Replay computes the outputs of real robots again, and shows every alteration."""
 
 import dataclasses
 from collections.abc import Callable
@@ -21,7 +21,7 @@ Messages = list[tuple[str, float, dict[str, Any]]]
 
 
 class Surroundings:
-    """A robot's sensor and odometry: it drifts over a bumpy world."""
+    """A robot's sensor and odometry, drifting over a bumpy world."""
 
     def __init__(self, robot: int) -> None:
         self._x_m, self._rng = 12.0 + 3.0 * robot, np.random.default_rng(robot)
@@ -35,7 +35,7 @@ class Surroundings:
 
 
 def fly(policy: LpacPolicy, payload: PayloadType = "float16", ticks: int = 6) -> Messages:
-    """The first of three robots' ticks, as its loops record them."""
+    """The first of three robots' ticks, in the form that its loops record."""
     parameters = PacParameters(scale=ModelScale(16.0, 0.25), max_speed_m_s=1.0, payload=payload)
     robots = []
     for robot in range(3):
@@ -87,13 +87,13 @@ def test_what_was_explored_is_logged_with_the_other_images(exploring_bundle: Bun
         assert (comparison.ticks, comparison.differing) == (6, 0)
     [images] = flown[0][2]["images"]
     image = dict(zip(MAP_CHANNELS[5], images, strict=True))
-    # It has looked once, around itself, far from the border: 64 of the local map's 256 cells.
+    # One observation around the robot, far from the border: 64 of the local map's 256 cells.
     assert image[EXPLORED].sum() * 16**2 == pytest.approx(64**2, rel=1e-5)
     assert image[EXPLORED][8, 8] == pytest.approx(1.0) and image[EXPLORED][0, 0] == 0.0
 
 
 def test_ticks_stand_for_themselves(shipped_policy: LpacPolicy) -> None:
-    """A log has gaps where the recorder dropped something."""
+    """A log has gaps where the recorder dropped messages."""
     flown = fly(shipped_policy)
     for comparison in replay(shipped_policy, flown[:0:-2]):
         assert comparison.ticks == 3 and comparison.differing == 0
@@ -145,7 +145,7 @@ def test_a_logged_nan_is_a_difference(shipped_policy: LpacPolicy) -> None:
         ("perception", lambda m: m.pop("images"), "perception at 1700000000.000 s: 'images'"),
         ("perception", lambda m: m.update(images=m["images"][0]), r"images: is \(4, 32, 32\)"),
         ("perception", lambda m: m.update(features=None), "features: is NoneType; .* needs"),
-        ("policy", lambda m: m.update(degree=1), "degree = 1: is less than its 2 payloads"),
+        ("policy", lambda m: m.update(degree=1), "degree = 1: must be at least 2, the payloads"),
         ("policy", lambda m: m.update(payloads=[np.zeros(3)]), r"payloads: is \(3,\)"),
         ("policy", lambda m: m.update(message=m["message"][:-1]), "refused: checksum"),
         ("policy", lambda m: m.update(message=b""), "refused: truncated"),

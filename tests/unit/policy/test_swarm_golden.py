@@ -1,4 +1,4 @@
-"""The decentralised swarm against the centralised network: torch_geometric, and the reference."""
+"""The decentralised swarm against the centralised network of torch_geometric and the reference."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -36,7 +36,7 @@ Neighbours = npt.NDArray[np.bool_]
 
 
 def geometric_graph(robots: int, seed: int = 0) -> Neighbours:
-    """Who hears whom among robots anywhere in a square; from lonely robots to crowds."""
+    """Adjacency of robots at random places in a square, from isolated to crowded."""
     places = np.random.default_rng(seed).uniform(0, 1, (robots, 2))
     radius = 2.0 if robots == 2 else 0.35
     near: Neighbours = np.hypot(*(places[:, None] - places[None]).T) < radius
@@ -142,7 +142,7 @@ def test_after_k_l_rounds_the_swarm_is_the_reference_librarys_network(
 
 
 def lpac_velocities(model: object, images: F32, positions: F32, neighbours: Neighbours) -> F32:
-    """CoverageControl's LPAC on the whole swarm, de-normalised as its controller does."""
+    """CoverageControl's LPAC on the whole swarm, de-normalised as by its controller."""
     data = pytest.importorskip("torch_geometric.data").Data(
         x=torch.from_numpy(images), pos=torch.from_numpy(positions),
         edge_index=torch.from_numpy(np.array(np.nonzero(neighbours))),
@@ -184,7 +184,7 @@ def test_the_authors_network_decentralised_is_their_network(authors_taps: Path) 
 def test_news_travels_one_hop_an_exchange_and_no_further_than_k_l(
     layers: int, hops: int, tmp_path: Path
 ) -> None:
-    """On a tree, changing a feature of robot 0 is seen after n exchanges by all within n hops."""
+    """On a tree, a changed feature of robot 0 reaches all within n hops after n exchanges."""
     policy = LpacPolicy(exported(random_state(layers=layers, hops=hops, latent=64), tmp_path))
     parents = np.array([0, 0, 0, 1, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11, 12])
     robots = len(parents)
@@ -210,7 +210,7 @@ def test_news_travels_one_hop_an_exchange_and_no_further_than_k_l(
 
 
 class Still:
-    """A robot that stands still over a world of its own."""
+    """A robot that stands still over its own world."""
 
     def __init__(self, position_m: tuple[float, float, float], seen: F32) -> None:
         self._position_m = position_m
@@ -239,7 +239,7 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: L
     for robot in robots:
         robot.clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     geometry = shipped_policy.geometry
-    # One exchange more than K L: the first messages only tell the robots who their neighbours are.
+    # One exchange more than K L: the first messages only give the robots their neighbours.
     for tick in range(geometry.hops * geometry.layers + 2):
         now_s = 0.4 * tick
         for robot in robots:
