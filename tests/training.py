@@ -1,4 +1,4 @@
-"""A training of seconds: three robots, a tiny network, one DAgger round."""
+"""A training that takes seconds: three robots, a tiny network, one DAgger round."""
 
 import tomllib
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -73,7 +73,7 @@ name = "small"
 
 
 def read(folder: Path, *changes: tuple[str, str]) -> ReadConfig:
-    """The small configuration, from a file in the folder, with some of its text changed."""
+    """The small configuration with changed text, from a file in the folder."""
     text = SMALL
     for old, new in changes:
         assert old in text
@@ -85,13 +85,13 @@ def read(folder: Path, *changes: tuple[str, str]) -> ReadConfig:
 
 
 def here(do: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
-    """A pool of this process alone; the last task is done first."""
+    """A pool of this process only, which runs the last task first."""
     for task in reversed(tasks):
         yield do(task)
 
 
 def said(told: Mapping[str, Any]) -> dict[str, Any]:
-    """What came of a training, without how long it took, and where it lies."""
+    """Results of a training without durations and paths."""
     return {
         key: value
         for key, value in told.items()

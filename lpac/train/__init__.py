@@ -1,1 +1,1 @@
-"""From a configuration to a policy: generate, fit, DAgger rounds, select, export."""
+"""Trains a policy from a configuration: generate, fit, DAgger rounds, select, export."""

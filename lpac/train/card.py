@@ -25,7 +25,7 @@ from lpac.train.task import CLAIRVOYANT
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelCard:
-    """All that the card tells; `shards` are the data's facts by name, hours of one machine."""
+    """Contents of the card. `shards` are the facts of each; hours are those of one machine."""
 
     config: TrainingConfig
     expert: str
@@ -49,7 +49,7 @@ class ModelCard:
 
 
 def write_card(card: ModelCard, folder: Path, bundle: Bundle, path: Path) -> None:
-    """README.md and figures/ in the folder; `bundle`, at `path`, is what was judged.
+    """Write README.md and figures/ into the folder; `bundle`, at `path`, is the evaluated one.
 
     Raises ValueError, OSError.
     """
@@ -63,7 +63,7 @@ def write_card(card: ModelCard, folder: Path, bundle: Bundle, path: Path) -> Non
 
 
 def _write_worlds(card: ModelCard, figures: Path, bundle: Bundle, path: Path) -> None:
-    """How the policy covered two of them, beside who knows all."""
+    """Draw two worlds, the first and the worst, flown by the policy and by ClairvoyantCVT."""
     select = card.config.select
     flights = flights_of(select, policy_of(path, bundle), path)
     clairvoyant = flights_of(select, Method.of(CLAIRVOYANT), path)
@@ -76,7 +76,7 @@ def _write_worlds(card: ModelCard, figures: Path, bundle: Bundle, path: Path) ->
 
 
 def _losses(card: ModelCard) -> Figure:
-    """The loss of each epoch, one after another; lines where a round begins."""
+    """The loss of each epoch; vertical lines where a round begins."""
     with style.figure(WIDTH_IN, 2.4) as figure:
         axes = figure.subplots()
         rounds = [loss.round for loss in card.losses]
@@ -87,7 +87,7 @@ def _losses(card: ModelCard) -> Figure:
         for place in np.flatnonzero(np.diff(rounds)) + 1.5:
             axes.axvline(place, color=style.FAINT, lw=0.8, zorder=0)
         axes.set(
-            xlabel="epoch; a line where a DAgger round begins",
+            xlabel="epoch; vertical lines: start of a DAgger round",
             ylabel="loss / variance of actions",
             ylim=(0.0, None),
         )
@@ -96,7 +96,7 @@ def _losses(card: ModelCard) -> Figure:
 
 
 def _costs(card: ModelCard) -> Figure:
-    """How each candidate flew."""
+    """The closed-loop cost of each candidate."""
     with style.figure(WIDTH_IN, 2.8) as figure:
         axes = figure.subplots()
         places = np.arange(len(card.judged))

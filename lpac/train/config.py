@@ -1,4 +1,4 @@
-"""Configuration of `lpac train`: TOML, as frozen dataclasses. Units are the model's, and s."""
+"""Configuration of `lpac train`: TOML as frozen dataclasses, in model units and s."""
 
 import hashlib
 import tomllib
@@ -33,12 +33,12 @@ from lpac.study.worlds import SET_UPS
 from lpac.train.family import Learnable, StateDict, learnable
 
 ExpertName = Literal["clairvoyant-cvt", "best-of-lloyd", "exploring-cvt"]
-# Of something that has files.
+# Name of a folder and files.
 FileName = Annotated[
     str,
     Meta(
         pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]*\Z",
-        description="letters, digits and _ . -, the first of the two",
+        description="letters, digits and _ . -; it begins with a letter or digit",
     ),
 ]
 _Duration = Annotated[float, Meta(ge=1.0, le=3600.0)]
@@ -52,7 +52,7 @@ _PAIR = Meta(min_length=2, max_length=2, description="[least, greatest]")
 
 
 def require_name(name: str) -> None:
-    """Of something that has files. Raises ValueError."""
+    """Raises ValueError if `name` is not a FileName."""
     require(FileName, name, "name")
 
 
@@ -64,9 +64,9 @@ def _require_ordered(**ranges: tuple[float, ...]) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldRanges(Bounded):
-    """Worlds, and the swarms in them: each flight draws from [least, greatest] of each.
+    """Worlds and swarms: each flight draws from [least, greatest] of each key.
 
-    `weight` is how often these worlds are drawn, beside others.
+    `weight` is the relative frequency of these worlds among all in the list.
     """
 
     weight: NonNegative = 1.0
@@ -88,12 +88,12 @@ class WorldRanges(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disturbances(Bounded):
-    """Faults in training flights; each draws from [least, greatest].
+    """Faults in training flights. Each flight draws from [least, greatest] of each key.
 
-    `loss` is the probability with which a message is lost, `delay_s` its way, `lag_s` the time
-    constant with which velocities follow, `position_bias` the standard deviation of each robot's
-    error in knowing its position, in model units. `lost_robots` fail in flight, each
-    comes back with the probability `come_back`.
+    `loss` is a message's probability of loss, `delay_s` its delay, `lag_s` the time constant of the
+    velocity response, `position_bias` the standard deviation, in model units, of each robot's
+    constant position error. `lost_robots` fail in flight; each returns with the probability
+    `come_back`.
     """
 
     loss: Annotated[tuple[Share, ...], _PAIR] = (0.0, 0.0)
@@ -115,12 +115,12 @@ class Disturbances(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataConfig(Bounded):
-    """The flights of the first data, which the expert flies; of every flight `states` are kept.
+    """Flights of round 0, flown by the expert; `states` are kept of each flight.
 
-    The expert soon is where it wants to be: short flights show most of it. `lloyd_runs` are those
-    of the expert "best-of-lloyd". Velocities that are imitated may be `overshoot` times max_speed,
-    which nobody flies faster than: so the mean of what an expert does where it cannot be foretold,
-    less than each of it, is still fast.
+    The expert soon reaches its goals, so short flights show most of its behaviour. `lloyd_runs` are
+    those of the expert "best-of-lloyd". Imitated velocities may reach `overshoot` times max_speed,
+    although no robot flies faster: where the expert's action is unpredictable, its mean is shorter
+    than any single action, and overshoot keeps that mean fast.
     """
 
     flights: AtLeastOne
@@ -141,13 +141,12 @@ class DataConfig(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitConfig(Bounded):
-    """Imitation of the expert: `epochs` over the first data, in batches of about `batch_robots`.
+    """Imitation of the expert: `epochs` over round 0, in batches of about `batch_robots`.
 
-    `begin_with` is a checkpoint that is trained on, its path from the configuration's folder; if
-    there is none, weights are drawn.
-    The learning rate falls to nothing along a cosine, in each round again. `lost_messages` is the
-    share of the graph's edges that is left out at random; with `symmetries` each state is mirrored
-    and turned at random. `bf16` computes in it where the machine does.
+    `begin_with` is a checkpoint with initial weights, its path relative to the configuration;
+    without it, weights are random. In each round the learning rate falls to zero along a cosine.
+    `lost_messages` is the share of the graph's edges removed at random. `symmetries` mirrors and
+    turns each state at random. `bf16` computes in bfloat16 on machines that support it.
     """
 
     epochs: AtLeastOne
@@ -162,10 +161,10 @@ class FitConfig(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DaggerConfig(Bounded):
-    """Rounds in which the policy flies, and the expert says what it should have done.
+    """Rounds in which the policy flies and the expert labels the states.
 
-    Of the `flights` of a round the expert flies the share `expert_flights`. `learning_rate` is the
-    share of fit's with which a round begins.
+    The expert flies the share `expert_flights` of a round's `flights`. A round's initial learning
+    rate is `learning_rate` times that of `fit`.
     """
 
     rounds: AtLeastZero = 0
@@ -178,10 +177,10 @@ class DaggerConfig(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SelectConfig(Bounded):
-    """Which weights are best: those that end with the least mean cost over validation worlds.
+    """Selection of the weights with the least mean final cost over validation worlds.
 
-    They are flown over the first `worlds` of that set in each of `set_ups` (`lpac evaluate` has
-    them), with messages lost, after every so many epochs and at the end of each round.
+    Candidates fly over the first `worlds` of the set in each of `set_ups` (see `lpac evaluate`),
+    with message loss `loss`, every `every_epochs` epochs and at the end of each round.
     """
 
     worlds: AtLeastOne = 20
@@ -206,7 +205,7 @@ class ExportConfig(Bounded):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingConfig(Bounded):
-    """All of it; `network` is what the policy family understands."""
+    """The whole configuration; the policy family interprets `network`."""
 
     perception: PerceptionParameters
     training: Training
@@ -226,9 +225,9 @@ class TrainingConfig(Bounded):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadConfig:
-    """A configuration, the network that it describes, and the file's text.
+    """A configuration, its network, and the file's text.
 
-    `initial` are the weights that training begins with, None for such as are drawn.
+    `initial` are the weights from `fit.begin_with`; None for random ones.
     """
 
     config: TrainingConfig
@@ -238,17 +237,17 @@ class ReadConfig:
 
     @property
     def digest(self) -> str:
-        """Of all that the configuration says but the number of rounds: more may follow."""
+        """Digest of the configuration without the number of rounds, which may grow later."""
         return config_digest(self.text)
 
 
 def read_config(path: Path) -> ReadConfig:
-    """Raises ConfigError that names the file, the line or key, the value and what is allowed."""
+    """Read a file. Raises ConfigError that names the file, the line or key, and what is allowed."""
     return config_of(read_toml_text(path), str(path), path.parent)
 
 
 def config_of(text: str, where: str, folder: Path) -> ReadConfig:
-    """Of TOML, whose paths are from that folder. Raises ConfigError that begins with `where`."""
+    """Parse TOML with paths relative to `folder`. Raises ConfigError that begins with `where`."""
     config = from_mapping(TrainingConfig, parse_toml(text, where), where)
     network = learnable(config.network, f"{where}: network")
     return ReadConfig(config, network, text, _initial(config, network, where, folder))
@@ -269,7 +268,7 @@ def _initial(
 
 
 def config_digest(text: str) -> str:
-    """Equal for texts that say the same, but for the number of DAgger rounds."""
+    """Digest that is equal for equal content, ignoring the number of DAgger rounds."""
     document = tomllib.loads(text)
     dagger = document.get("dagger")
     if isinstance(dagger, dict):

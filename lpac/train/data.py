@@ -1,7 +1,7 @@
-"""The data of a run on disk: shards that are added and never replaced, and a manifest of them.
+"""A run's data on disk: shards that are added, never replaced, and their manifest.
 
-A shard is written beside its place and moved there, and then has its line in the manifest: what
-was killed before is flown again, and comes out the same.
+A shard is written to a temporary file, moved into place, then added to the manifest. A shard that
+was interrupted is flown again, with the same result.
 """
 
 from collections.abc import Mapping
@@ -21,21 +21,21 @@ _INPUT = "input/"
 
 
 class Shards:
-    """Those in a folder, which belong to one configuration."""
+    """The shards of one configuration in a folder."""
 
     def __init__(self, folder: Path, config: str) -> None:
-        """`config` is its digest: shards of another one do not count. Raises OSError."""
+        """`config` is a digest; shards of other configurations are ignored. Raises OSError."""
         self._folder = folder
         self._kept = KeptOutcomes(folder / _MANIFEST, {"config": config})
 
     @property
     def facts(self) -> dict[str, dict[str, Any]]:
-        """Manifest entry of each shard that is there, by name."""
+        """Manifest entry of each shard with a file, by name."""
         lines = {line["shard"]: line for line in self._kept.lines}
         return {name: line for name, line in lines.items() if self._path(name).exists()}
 
     def add(self, name: str, states: States, facts: Mapping[str, Any]) -> None:
-        """Keep a shard, and in the manifest `facts` of it. Raises OSError."""
+        """Write a shard, and `facts` to the manifest. Raises OSError."""
         arrays: dict[str, Any] = {f"{_INPUT}{key}": rows for key, rows in states.inputs.items()}
         new = self._folder / "new.npz"
         with new.open("wb") as file:
@@ -55,7 +55,7 @@ class Shards:
         )
 
     def load(self, last_round: int) -> "Dataset":
-        """All shards up to that round, in the order of their names. Raises OSError, ValueError."""
+        """Load all shards up to that round, in order of name. Raises OSError, ValueError."""
         columns: dict[str, list[npt.NDArray[Any]]] = {}
         for name in sorted(self.facts):
             if int(name.partition("-")[0]) > last_round:
@@ -65,7 +65,7 @@ class Shards:
                     for key in shard.files:
                         columns.setdefault(key, []).append(shard[key])
             except (ValueError, KeyError, EOFError) as error:
-                raise ValueError(f"{self._path(name)}: cannot be read: {error}") from None
+                raise ValueError(f"{self._path(name)}: unreadable shard: {error}") from None
         whole = {key: np.concatenate(columns.pop(key)) for key in list(columns)}
         inputs = {
             key.removeprefix(_INPUT): rows for key, rows in whole.items() if key.startswith(_INPUT)
@@ -78,9 +78,9 @@ class Shards:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """B swarms of at most N robots, R in all: `inputs` and `velocities` (R, ...).
+    """B swarms of at most N robots, R in total: `inputs` and `velocities` (R, ...).
 
-    `present` (B, N) and `adjacency` (B, N, N) are as `TrainableModule` has them.
+    `present` (B, N) and `adjacency` (B, N, N) are as in `TrainableModule`.
     """
 
     inputs: dict[str, npt.NDArray[np.floating]]
@@ -110,7 +110,7 @@ class Dataset:
         return len(self.robots)
 
     def batches(self, rng: np.random.Generator, robots: int) -> list[npt.NDArray[np.intp]]:
-        """All states, shuffled, in batches of at most so many robots; of one state at least."""
+        """Shuffle all states into batches of at most `robots` robots, or of a single state."""
         order = rng.permutation(len(self))
         batches: list[npt.NDArray[np.intp]] = []
         start, full = 0, 0
@@ -122,7 +122,7 @@ class Dataset:
         return [*batches, order[start:]]
 
     def batch(self, states: npt.NDArray[np.intp]) -> Batch:
-        """These states."""
+        """Batch of the states with these indices."""
         sizes = self.robots[states]
         present = np.arange(sizes.max()) < sizes[:, None]
         adjacency = np.zeros((*present.shape, present.shape[1]), np.bool_)

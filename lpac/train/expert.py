@@ -1,8 +1,8 @@
-"""Experts to imitate, which know where all robots truly are.
+"""Experts to imitate. They know the true positions of all robots.
 
-Most know the whole world, too. What such a one does where a robot has seen nothing cannot be
-learned, only its mean: to stay about where one is. "exploring-cvt" knows what all robots together
-have seen, which is what robots that share maps come to know: it goes and looks.
+Most also know the whole world. Their actions in unseen areas cannot be predicted, and imitation
+yields the mean: to stay near the present place. "exploring-cvt" knows what all robots together have
+seen, which robots that share maps learn too, and explores.
 """
 
 import math
@@ -21,19 +21,20 @@ from lpac.train.config import DataConfig
 
 Indices = npt.NDArray[np.intp]
 
-# How often an expert looks around, s.
+# Period of an expert's observations, s.
 LOOK_PERIOD_S = 0.5
-# Of the expert that explores, in model units: its lattice; how much further what is unseen may be
-# to count e times less; how far its goal is where all that is unseen is in one direction. In eight
-# training worlds of the field it ended at 0.256 of the first cost (clairvoyant 0.263), and was at
-# 0.32 after 20 s; with a decay of 32 at 0.56. With 12 it left what is far unseen: 0.39.
+# Parameters of the exploring expert, in model units: pitch of its lattice; distance over which the
+# weight of an unseen cell falls by 1/e; distance of the goal if all unseen cells are in one
+# direction. In eight training worlds of the field it ended at 0.256 of the initial cost
+# (clairvoyant 0.263), and had 0.32 after 20 s. A decay of 32 gave 0.56 after 20 s; a decay of 12
+# left distant areas unexplored (0.39).
 _PITCH = 8
 _DECAY = 18.0
 _STEP = 24.0
 
 
 class Goals(Protocol):
-    """Where `robots` (m,) of those at `positions` (n, 2), all that are left, should go: (m, 2).
+    """Goals (m, 2) of `robots` (m,), indices into the working robots at `positions` (n, 2).
 
     In model units.
     """
@@ -41,23 +42,23 @@ class Goals(Protocol):
     def __call__(self, positions: F64, robots: Indices) -> F64: ...
 
     def look(self, positions: F64) -> None:
-        """Take notice of what the robots there see."""
+        """Update what the robots at `positions` have seen."""
 
 
 class Expert:
-    """The velocities of one world's robots, limited as a policy's are."""
+    """Velocities of one world's robots, with a policy's speed limit."""
 
     def __init__(self, goals: Goals, max_speed: float, reach: float) -> None:
-        """A robot closer to its goal than `max_speed` times `reach` slows down.
+        """Slow down robots nearer to their goal than `max_speed` times `reach`.
 
-        In model units, and model units/s as the policy has them, however fast they are flown.
+        In model units and the policy's model units/s, whatever the velocity scale.
         """
         self._goals = goals
         self._max_speed = max_speed
         self._reach = reach
 
     def look(self, positions: F64, alive: Bools) -> None:
-        """Take notice of what the robots at `positions` (N, 2) see that are left."""
+        """Update what the robots at `positions` (N, 2) that are `alive` have seen."""
         self._goals.look(positions[alive])
 
     def velocities(
@@ -67,7 +68,7 @@ class Expert:
         robots: Sequence[int] | None = None,
         moving: F64 | None = None,
     ) -> F64:
-        """See `Teacher`; it does not matter how they move."""
+        """See `Teacher`; `moving` is not used."""
         asked = np.arange(len(positions)) if robots is None else np.array(robots, np.intp)
         velocities = np.zeros((len(asked), 2))
         flying = alive[asked]
@@ -81,9 +82,9 @@ class Expert:
 
 
 def make_expert(config: DataConfig, world: Preparation) -> Expert:
-    """The configured one, for that world."""
+    """Make the configured expert for a world."""
     scale, training = world.scenario.scale, world.bundle.manifest.training
-    # What a velocity of 1 comes to in flight, in model units/s: so it arrives within a time step.
+    # A policy velocity of 1 in flight, in model units/s: the expert arrives within one time step.
     flown = scale.env_scale * scale.velocity_scale
     limit = training.max_speed * config.overshoot
     return Expert(_goals(config, world), limit, training.time_step * flown)
@@ -100,17 +101,17 @@ def _goals(config: DataConfig, world: Preparation) -> Goals:
 
 
 class _Clairvoyant:
-    """Has seen everything."""
+    """Base of experts that know the whole world."""
 
     def look(self, positions: F64) -> None:
-        """There is nothing new."""
+        """Do nothing."""
 
 
 class _Centroids(_Clairvoyant):
-    """ClairvoyantCVT's, on a coarser raster.
+    """ClairvoyantCVT's centroids, on a coarser raster.
 
-    Of ten robots in 512 x 512 it takes a third of the time; a test holds the centroids to the fine
-    raster's within 0.2 model units on average, and the cost at the end to 1 %.
+    A third of the time for ten robots in 512 x 512. A test bounds the mean difference from the fine
+    raster's centroids by 0.2 model units, and that of the final cost by 1 %.
     """
 
     def __init__(self, importance: F32) -> None:
@@ -126,12 +127,12 @@ class _Centroids(_Clairvoyant):
 
 
 class _LloydEnds(_Clairvoyant):
-    """The best ends of several runs of Lloyd's algorithm, shared out among the robots."""
+    """The best result of several runs of Lloyd's algorithm, assigned to the robots."""
 
     def __init__(self, importance: F32, runs: int) -> None:
         self._importance = importance
         self._runs = runs
-        # By the number of robots that are left.
+        # By the number of working robots.
         self._best: dict[int, F64] = {}
 
     def __call__(self, positions: F64, robots: Indices) -> F64:
@@ -147,10 +148,10 @@ class _LloydEnds(_Clairvoyant):
 
 
 class _Exploring:
-    """Explores its own Voronoi cell of its local map and covers it, the more the less is unseen.
+    """Explores a robot's Voronoi cell within its local map, and covers it as it becomes known.
 
-    What `lpac.sim.baselines.FrontierCvt` does, but without its jumps from one goal to another: the
-    mean of what is done on both sides of a jump is to stay, and that is what would be learned.
+    Like `lpac.sim.baselines.FrontierCvt`, but continuous: where goals jump, imitation would learn
+    the mean of both sides, which is to stay.
     """
 
     def __init__(self, importance: F32, perception: PerceptionParameters) -> None:
@@ -197,18 +198,18 @@ class _Exploring:
             to_cover *= min(1.0, _STEP / max(float(np.linalg.norm(to_cover)), 1e-12))
             exploring = pull.sum() / (pull.sum() + 1.0)
             to_goal = exploring * to_explore + (1.0 - exploring) * to_cover
-            # Further than a step where it explores: there it cannot be too fast.
+            # Move the goal further away while exploring, so that the robot does not slow down.
             goals[row] += (1.0 + exploring) * to_goal
         return goals
 
 
 def assignment(cost: F64) -> Indices:
-    """(n,): the column of each row of `cost` (n, n), each once, so that their sum is least.
+    """Column of each row (n,) in the assignment of least total `cost` (n, n).
 
     Shortest augmenting paths with potentials: Jonker and Volgenant, Computing 38 (1987).
     """
     n = len(cost)
-    row_of = np.full(n + 1, -1)  # of each column; the last is where a search begins
+    row_of = np.full(n + 1, -1)  # of each column; the last one is the start of a search
     of_rows, of_columns = np.zeros(n), np.zeros(n + 1)
     for row in range(n):
         column, row_of[n] = n, row

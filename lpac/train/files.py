@@ -1,10 +1,10 @@
-"""Files that are never found half written."""
+"""Atomic writes."""
 
 from pathlib import Path
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace what is at `path`. Raises OSError, and then what was there is still there."""
+    """Replace the file at `path`. Raises OSError, and then the old file is unchanged."""
     path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_name(f"{path.name}.new")
     new.write_bytes(content)

@@ -1,7 +1,7 @@
-"""Imitation: weights that make of what robots perceive what the expert would do.
+"""Imitation learning: fits weights to the expert's velocities.
 
-All that is random in an epoch follows from the seed, the round and the epoch's number, and in a
-batch from its number: what is killed and goes on comes to the same weights.
+Random numbers of an epoch follow from seed, round and epoch; those of a batch also from its number.
+A run that was killed continues to the same weights.
 """
 
 import io
@@ -21,13 +21,13 @@ from lpac.train.data import Dataset
 from lpac.train.family import Learnable, StateDict, shift_operator
 from lpac.train.files import write_atomically
 
-_KEPT_EVERY_S = 120.0
-_LARGEST_GRADIENT = 1.0
-_LEAST_DEVIATION = 1e-3
+_SAVE_PERIOD_S = 120.0
+_MAX_GRADIENT_NORM = 1.0
+_MIN_DEVIATION = 1e-3
 
 
 class EpochLoss(NamedTuple):
-    """The mean loss over an epoch: of 1 is what the expert's mean action has."""
+    """Mean loss over an epoch, relative to that of the expert's mean action."""
 
     round: int
     epoch: int
@@ -36,7 +36,7 @@ class EpochLoss(NamedTuple):
 
 @dataclass(slots=True)
 class _Position:
-    """Where the fit is: so many batches of that epoch of that round are done."""
+    """Progress of the fit: batches done in an epoch of a round."""
 
     round: int = 0
     epoch: int = 0
@@ -44,7 +44,7 @@ class _Position:
 
 
 class Fit:
-    """The weights, and how far they are; kept in a file."""
+    """The weights and the progress of the fit, saved in a file."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Fit:
         path: Path,
         initial: StateDict | None = None,
     ) -> None:
-        """Goes on with the file at `path`, if there is one; else from `initial`, or as drawn.
+        """Continue from the file at `path`; without it, begin with `initial` or random weights.
 
         Raises OSError, ValueError.
         """
@@ -71,35 +71,35 @@ class Fit:
         self.losses: list[EpochLoss] = []
         self.seconds = 0.0
         self._sum = 0.0
-        self._kept: dict[str, Any] | None = None
+        self._saved: dict[str, Any] | None = None
         self._deviation = torch.ones(2)
         if path.exists():
             self._read()
 
     @property
     def device(self) -> str:
-        """On what it computes."""
+        """The device, and bf16 if used."""
         return f"{self._device.type}{', bf16' if self._bf16 else ''}"
 
     def epochs(self, round_: int) -> int:
-        """How many that round has."""
+        """Number of epochs of a round."""
         return self._config.epochs if round_ == 0 else self._dagger.epochs
 
     def done(self, round_: int) -> int:
-        """How many epochs of that round are done."""
+        """Number of epochs of a round that are done."""
         at = self._at
         return at.epoch if at.round == round_ else self.epochs(round_) if at.round > round_ else 0
 
     def untrained(self) -> StateDict:
-        """As training begins with them, for a bundle whose inputs are needed, not its actions."""
+        """Initial weights, for a bundle that only defines the inputs."""
         zero, one = np.zeros(2, np.float32), np.ones(2, np.float32)
-        return self._drawn(zero, one).state_dict()
+        return self._new_module(zero, one).state_dict()
 
     @property
     def weights(self) -> StateDict:
-        """As they are now."""
-        assert self._kept is not None
-        weights: StateDict = self._kept["module"]
+        """The present weights."""
+        assert self._saved is not None
+        weights: StateDict = self._saved["module"]
         return weights
 
     def run(
@@ -107,18 +107,18 @@ class Fit:
         data: Dataset,
         round_: int,
         until_epoch: int,
-        tell: Callable[[float, float], None],
+        report: Callable[[float, float], None],
     ) -> None:
-        """Fit up to the end of that epoch of that round, on all data so far.
+        """Fit up to the end of an epoch of a round, on all data.
 
-        `tell` is called with the share of the whole round's batches that are done, and the mean
-        loss of the epoch so far. Raises ValueError if the loss is not finite, and OSError.
+        Calls `report` with the share of the round's batches that are done and the mean loss of the
+        present epoch. Raises ValueError if the loss is not finite, and OSError.
         """
         if self._at.round < round_:
             self._at = _Position(round_)
         if self.done(round_) >= until_epoch:
             return
-        module, optimiser = self._restored(data)
+        module, optimiser = self._restore(data)
         begun_s = kept_s = time.monotonic()
         before_s = self.seconds
         while self._at.epoch < until_epoch:
@@ -137,14 +137,14 @@ class Fit:
                     )
                 self._sum += loss
                 at.batch = number + 1
-                tell((done + 1) / total, self._sum / at.batch)
+                report((done + 1) / total, self._sum / at.batch)
                 self.seconds = before_s + time.monotonic() - begun_s
-                if at.batch < len(batches) and time.monotonic() - kept_s > _KEPT_EVERY_S:
-                    self._keep(module, optimiser)
+                if at.batch < len(batches) and time.monotonic() - kept_s > _SAVE_PERIOD_S:
+                    self._save(module, optimiser)
                     kept_s = time.monotonic()
             self.losses.append(EpochLoss(round_, at.epoch + 1, self._sum / len(batches)))
             self._at, self._sum = _Position(round_, at.epoch + 1), 0.0
-            self._keep(module, optimiser)
+            self._save(module, optimiser)
 
     def _step(
         self,
@@ -161,24 +161,24 @@ class Fit:
             inputs, velocities = self._network.symmetric(  # type: ignore[assignment]
                 inputs, velocities, int(rng.integers(8))
             )
-        heard = rng.random(batch.adjacency.shape, np.float32) >= self._config.lost_messages
-        shift = self._put(shift_operator(batch.adjacency, heard))
+        received = rng.random(batch.adjacency.shape, np.float32) >= self._config.lost_messages
+        shift = self._to_device(shift_operator(batch.adjacency, received))
         module.train(len(velocities) > 1)
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
-            told = module(
-                {name: self._put(values) for name, values in inputs.items()},
+            predicted = module(
+                {name: self._to_device(values) for name, values in inputs.items()},
                 shift,
                 torch.from_numpy(batch.present).to(self._device),
             )
-        error = (told - self._put(velocities)) / self._deviation.to(self._device)
+        error = (predicted - self._to_device(velocities)) / self._deviation.to(self._device)
         loss = error.square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(module.parameters(), _LARGEST_GRADIENT)
+        torch.nn.utils.clip_grad_norm_(module.parameters(), _MAX_GRADIENT_NORM)
         optimiser.step()
         return float(loss.item())
 
-    def _put(self, values: "np.ndarray[Any, np.dtype[np.floating[Any]]]") -> torch.Tensor:
+    def _to_device(self, values: "np.ndarray[Any, np.dtype[np.floating[Any]]]") -> torch.Tensor:
         return torch.from_numpy(values).to(self._device, torch.float32)
 
     def _learning_rate(self, round_: int, done: float) -> float:
@@ -189,7 +189,7 @@ class Fit:
         key = [self._seed, self._at.round, self._at.epoch, *of]
         return np.random.default_rng(np.random.SeedSequence(key))
 
-    def _drawn(self, mean: F32, deviation: F32) -> torch.nn.Module:
+    def _new_module(self, mean: F32, deviation: F32) -> torch.nn.Module:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
             module = self._network.module(mean, deviation)
@@ -197,28 +197,28 @@ class Fit:
             module.load_state_dict(self._initial)
         return module
 
-    def _restored(self, data: Dataset) -> tuple[torch.nn.Module, torch.optim.Optimizer]:
-        """The module and its optimiser, as they were kept, or new."""
+    def _restore(self, data: Dataset) -> tuple[torch.nn.Module, torch.optim.Optimizer]:
+        """The module and its optimiser, restored or new."""
         mean = data.velocities.mean(axis=0)
-        deviation = np.maximum(data.velocities.std(axis=0), _LEAST_DEVIATION)
-        if self._kept is not None:
-            # Outputs keep their meaning: the scale of the first data stays.
-            mean, deviation = (self._kept[name].numpy() for name in ("mean", "deviation"))
-        module = self._drawn(mean, deviation).to(self._device)
+        deviation = np.maximum(data.velocities.std(axis=0), _MIN_DEVIATION)
+        if self._saved is not None:
+            # Keep the scale of the first data, so that the outputs keep their meaning.
+            mean, deviation = (self._saved[name].numpy() for name in ("mean", "deviation"))
+        module = self._new_module(mean, deviation).to(self._device)
         optimiser = torch.optim.AdamW(
             module.parameters(),
             lr=self._config.learning_rate,
             weight_decay=self._config.weight_decay,
         )
         self._mean, self._deviation = torch.from_numpy(mean), torch.from_numpy(deviation)
-        if self._kept is not None:
-            module.load_state_dict(self._kept["module"])
-            optimiser.load_state_dict(self._kept["optimiser"])
+        if self._saved is not None:
+            module.load_state_dict(self._saved["module"])
+            optimiser.load_state_dict(self._saved["optimiser"])
         return module, optimiser
 
-    def _keep(self, module: torch.nn.Module, optimiser: torch.optim.Optimizer) -> None:
+    def _save(self, module: torch.nn.Module, optimiser: torch.optim.Optimizer) -> None:
         at = self._at
-        self._kept = {
+        self._saved = {
             "module": {name: t.detach().cpu().clone() for name, t in module.state_dict().items()},
             "optimiser": optimiser.state_dict(),
             "mean": self._mean,
@@ -229,7 +229,7 @@ class Fit:
             "seconds": self.seconds,
         }
         buffer = io.BytesIO()
-        torch.save(self._kept, buffer)
+        torch.save(self._saved, buffer)
         write_atomically(self._path, buffer.getvalue())
 
     def _read(self) -> None:
@@ -240,9 +240,9 @@ class Fit:
             self.losses = [EpochLoss(*loss) for loss in kept["losses"]]
         except OSError:
             raise
-        except Exception as error:  # torch raises many kinds on what it cannot read
-            raise ValueError(f"{self._path}: cannot be gone on with: {error}") from None
-        self._kept = kept
+        except Exception as error:  # torch raises many types for unreadable files
+            raise ValueError(f"{self._path}: cannot continue from this file: {error}") from None
+        self._saved = kept
 
 
 def _computes_bf16(device: torch.device) -> bool:

@@ -1,7 +1,7 @@
-"""The paper's family as one that is trained: CNN, aggregated graph neural network, MLP.
+"""Training of the paper's family: CNN, aggregated graph neural network, MLP.
 
-The state dict has the tensors that CoverageControl's LPAC module has, by their names: it loads
-there if all convolutions have as many channels as the CNN puts out features, and the four maps.
+The state dict has the tensors and names of CoverageControl's LPAC module, which loads it if the
+network has the four maps and every convolution has as many channels as the CNN has features.
 """
 
 import io
@@ -34,7 +34,7 @@ from lpac.train.family import Inputs, StateDict
 from lpac.train.task import CoverageTask
 
 _FIRST_CONVOLUTION = "cnn_backbone.conv0.weight"
-# A count that nothing is computed from, which not every checkpoint has.
+# A counter without effect, missing in some checkpoints.
 _BATCHES = "num_batches_tracked"
 
 
@@ -42,12 +42,12 @@ _BATCHES = "num_batches_tracked"
 class LpacNetwork(Bounded):
     """Sizes of the network: see `Learnable`.
 
-    `channels` are the images that the CNN sees, one of `MAP_CHANNELS`, `image_size` wide;
-    `cnn_channels` those of each convolution, `kernel` wide. Then `layers` (L) of `hops` (K),
-    `width` wide, and an MLP of `mlp_layers` layers `mlp_width` wide. With 0 hops robots see where
-    neighbours are, but heed nothing of what they say: the checkpoint has one hop, of weight 0.
+    `channels` are the CNN's input images, one of `MAP_CHANNELS`, `image_size` wide; `cnn_channels`
+    are those of each convolution, `kernel` wide. Then follow `layers` (L) of `hops` (K), `width`
+    wide, and an MLP of `mlp_layers` layers, `mlp_width` wide. With 0 hops robots use their
+    neighbours' positions but not their messages: the checkpoint has one hop, of weight 0.
 
-    Raises ValueError that names what is impossible.
+    Raises ValueError that names the impossible value.
     """
 
     channels: tuple[str, ...] = MAP_CHANNELS[4]
@@ -68,12 +68,12 @@ class LpacNetwork(Bounded):
         if self._side < 1:
             raise ValueError(
                 f"image_size = {self.image_size}: must be above {self.image_size - self._side}, "
-                "what the convolutions take off"
+                "the border that the convolutions remove"
             )
 
     @property
     def _side(self) -> int:
-        """Of the images that the last convolution puts out."""
+        """Side of the last convolution's output."""
         return self.image_size - len(self.cnn_channels) * (self.kernel - 1)
 
     @property
@@ -86,9 +86,11 @@ class LpacNetwork(Bounded):
         return LpacModule(self, self._side, actions_mean, actions_std)
 
     def initial(self, checkpoint: bytes, name: str) -> StateDict:
-        """See `Learnable`; images that the checkpoint's CNN does not see have weights of 0."""
+        """See `Learnable`; images unknown to the checkpoint's CNN get weights of 0."""
         if not self.hops:
-            raise ValueError(f"{name}: weights of hops are of no use to a network of hops = 0")
+            raise ValueError(
+                f"{name}: a network of hops = 0 cannot use the checkpoint's hops: remove begin_with"
+            )
         zero, one = np.zeros(ACTION_SIZE, np.float32), np.ones(ACTION_SIZE, np.float32)
         state = self.module(zero, one).state_dict()
         tensors = checkpoint_tensors(checkpoint, name)
@@ -112,7 +114,7 @@ class LpacNetwork(Bounded):
     def symmetric(self, inputs: Inputs, velocities: F32, turned: int) -> tuple[Inputs, F32]:
         """See `Learnable`; bit 0 mirrors x, bit 1 mirrors y, bit 2 swaps the two."""
         images, position = inputs["images"], inputs["position_feature"]
-        # What changes its sign, or its place, where the world is mirrored.
+        # Channels that change sign or order in a mirrored world.
         plane = {name: self.channels.index(name) for name in NEIGHBOURS if name in self.channels}
         for axis in range(2):
             if turned & 1 << axis:
@@ -138,7 +140,7 @@ class LpacNetwork(Bounded):
         return turned_inputs, np.ascontiguousarray(velocities)
 
     def checkpoint(self, state: StateDict) -> bytes:
-        """See `Learnable`; what `torch.load` reads."""
+        """See `Learnable`; a file for `torch.load`."""
         buffer = io.BytesIO()
         torch.save({name: tensor.detach().cpu() for name, tensor in state.items()}, buffer)
         return buffer.getvalue()
@@ -163,7 +165,7 @@ def lpac_network(network: Mapping[str, object], where: str) -> LpacNetwork:
 
 
 class LpacModule(nn.Module):
-    """See `TrainableModule`; what `export.network.centralised` computes, for training."""
+    """See `TrainableModule`; computes `export.network.centralised`, for training."""
 
     actions_mean: Tensor
     actions_std: Tensor
@@ -203,7 +205,7 @@ class _Cnn(nn.Module):
         self.linear_1 = nn.Linear(inputs * side**2, network.features)
 
     def forward(self, images: Tensor) -> Tensor:
-        # A CPU is a fifth faster so.
+        # A fifth faster on a CPU.
         values = images.contiguous(memory_format=torch.channels_last)
         for i in range(self._convolutions):
             values = self.get_submodule(f"conv{i}")(values)
@@ -235,9 +237,9 @@ class _GraphLayer(nn.Module):
         self.lins = nn.ModuleList(
             nn.Linear(inputs, outputs, bias=False) for _ in range(max(hops, 1) + 1)
         )
-        if not hops:  # what flies has one at least
-            for unheeded in self.lins[1].parameters():
-                nn.init.zeros_(unheeded.requires_grad_(False))
+        if not hops:  # bundles have at least one hop
+            for unused in self.lins[1].parameters():
+                nn.init.zeros_(unused.requires_grad_(False))
         self.bias = nn.Parameter(torch.zeros(outputs))
 
     def forward(self, swarms: Tensor, shift: Tensor) -> Tensor:
@@ -250,7 +252,7 @@ class _GraphLayer(nn.Module):
 
 
 class _Norm(nn.Module):
-    """The state dict calls it so."""
+    """Adds the level `module` to the names in the state dict."""
 
     def __init__(self, size: int) -> None:
         super().__init__()

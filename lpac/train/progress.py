@@ -1,4 +1,4 @@
-"""How far a run is, and how long it still takes."""
+"""Progress and remaining time of a run."""
 
 import time
 from collections import defaultdict
@@ -11,8 +11,8 @@ Stage = Literal["generate", "fit", "select", "export"]
 class RunProgress(NamedTuple):
     """Present stage of a run.
 
-    `done` is the share of all its work; `loss` that of the newest epoch, `cost` the least mean
-    closed-loop cost so far. `left_s` is None as long as nobody knows.
+    `done` is the share of the whole run; `loss` is that of the newest epoch, `cost` the least mean
+    closed-loop cost of a candidate. `left_s` is None while it is unknown.
     """
 
     stage: Stage
@@ -24,20 +24,20 @@ class RunProgress(NamedTuple):
 
 
 class Work:
-    """Counts what is to be done, in units of each stage, and times it."""
+    """Counts the work done, in units of each stage, and times it."""
 
     def __init__(
         self,
         planned: dict[Stage, float],
-        tell: Callable[[RunProgress], None],
+        report: Callable[[RunProgress], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`planned` are the units of each stage in all rounds; only those of one stage compare."""
+        """`planned` are the units of each stage in all rounds, which differ between stages."""
         self._planned = planned
-        self._tell = tell
+        self._report = report
         self._clock = clock
         self._done: dict[Stage, float] = defaultdict(float)
-        # Of what was done by this process, and not before.
+        # Done by this process, without earlier work.
         self._timed: dict[Stage, float] = defaultdict(float)
         self._seconds: dict[Stage, float] = defaultdict(float)
         self._since: float = clock()
@@ -45,15 +45,15 @@ class Work:
         self.cost: float | None = None
 
     def skip(self, stage: Stage, units: float) -> None:
-        """So many were done before."""
+        """Count units that were done before."""
         self._done[stage] += units
 
     def begin(self) -> None:
-        """Time the work from now on."""
+        """Start timing."""
         self._since = self._clock()
 
     def add(self, stage: Stage, round_: int, units: float) -> None:
-        """So many more are done."""
+        """Count units that were done since the last call, and report progress."""
         now = self._clock()
         self._seconds[stage] += now - self._since
         self._since = now
@@ -62,7 +62,7 @@ class Work:
         self.show(stage, round_)
 
     def show(self, stage: Stage, round_: int) -> None:
-        """Tell how far it is."""
+        """Report progress."""
         left = {
             each: max(planned - self._done[each], 0.0) for each, planned in self._planned.items()
         }
@@ -75,7 +75,7 @@ class Work:
         shares = [
             1.0 - left[each] / planned for each, planned in self._planned.items() if planned > 0
         ]
-        self._tell(
+        self._report(
             RunProgress(
                 stage,
                 round_,

@@ -1,7 +1,7 @@
-"""Flights that make data: what robots perceive in the batched simulator, and what the expert says.
+"""Generates data: states in the batched simulator with the expert's velocities.
 
-Which flights, and all that is random in them, follows from the configuration, the round and the
-flight's number. Processes fly them, a shard at a time: this module loads no torch.
+Flights and their random numbers follow from the configuration, the round and the flight's number.
+Worker processes fly a shard at a time; this module does not import torch.
 """
 
 import time
@@ -25,17 +25,17 @@ from lpac.train.config import DaggerConfig, DataConfig, Disturbances
 from lpac.train.expert import LOOK_PERIOD_S
 from lpac.train.task import CoverageTask, Task, Teacher
 
-# Of one shard: larger batches of the simulator are no faster, and a kill costs one.
+# In a shard: larger batches are no faster, and a kill loses one shard.
 _ROBOTS_TOGETHER = 40
-# Each training seed has worlds of its own, of the training set's.
+# Each training seed draws its own worlds from the training set.
 _WORLDS_PER_SEED = 1_000_000
-# By then all robots have perceived.
+# All robots have perceived once by then.
 _FIRST_STATE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedShard:
-    """Flights whose states are kept together, those at `times_s`; the expert flies some of them."""
+    """Flights whose states at `times_s` are stored together; the expert flies those `by_expert`."""
 
     name: str
     scenarios: tuple[Scenario, ...]
@@ -45,7 +45,7 @@ class PlannedShard:
 
 
 class ShardTask(NamedTuple):
-    """A shard to fly; the bundle says what is perceived, and flies if the expert does not."""
+    """A shard to fly. The bundle defines the inputs, and flies unless the expert does."""
 
     shard: PlannedShard
     bundle: Bundle
@@ -54,11 +54,12 @@ class ShardTask(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """S states of swarms, in all of R robots; those that had failed are left out.
+    """S states of swarms, with R robots in total; failed robots are left out.
 
     `inputs` (R, ...) by name, images as float16; `velocities` (R, 2) are the expert's, in model
-    units/s; `robots` (S,) says how many robots each state has, and `adjacency` (sum of their
-    squares,) who is in range of whom, row by row. `largest_payload` is that of the flights.
+    units/s; `robots` (S,) is the number of robots of each state, and `adjacency` (sum of their
+    squares,) which of them are in range, row by row. `largest_payload` is the flights' largest
+    number in a payload.
     """
 
     inputs: dict[str, npt.NDArray[np.floating]]
@@ -71,7 +72,7 @@ class States:
 def plan_round(
     data: DataConfig, dagger: DaggerConfig, seed: int, round_: int
 ) -> list[PlannedShard]:
-    """The shards of a round; the expert alone flies round 0."""
+    """The shards of a round; the expert flies all of round 0."""
     flights = data.flights if round_ == 0 else dagger.flights
     first = 0 if round_ == 0 else data.flights + (round_ - 1) * dagger.flights
     duration_s = data.duration_s if round_ == 0 else dagger.duration_s
@@ -96,7 +97,7 @@ def plan_round(
 
 
 def _draw_times_s(states: int, duration_s: float, seed: list[int]) -> tuple[float, ...]:
-    """One in each of so many parts of the flight, all as long."""
+    """Draw one time in each of `states` equal parts of the flight."""
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     edges = np.linspace(_FIRST_STATE_S, duration_s, states + 1)
     return tuple(rng.uniform(edges[:-1], edges[1:]).tolist())
@@ -157,7 +158,7 @@ def _draw_failures(
 
 
 class FlownShard(NamedTuple):
-    """A shard's states, and the CPU time that they took."""
+    """A shard's states and their CPU time."""
 
     name: str
     states: States
@@ -165,16 +166,16 @@ class FlownShard(NamedTuple):
 
 
 def fly_shard(task: ShardTask) -> FlownShard:
-    """Fly it, in whatever process this is. Raises BundleError, ValueError."""
+    """Fly a shard, in any process. Raises BundleError, ValueError."""
     shard, bundle, taught = task
     begun_s = time.process_time()
-    deciding = _Deciding(shard.by_expert)
+    deciding = _MixedAgents(shard.by_expert)
     flights = BatchedFlights(shard.scenarios, bundle, agents=deciding.of)
     experts = [taught.teacher(shard.data, world) for world in flights.prepared]
     deciding.watch(flights, experts)
     looks_s = np.arange(0.0, max(shard.times_s), LOOK_PERIOD_S).tolist()
     times_s = sorted({*shard.times_s, *looks_s})
-    kept = _Kept()
+    kept = _StateBuffer()
     try:
         for moments in flights.moments(times_s):
             for moment, expert in zip(moments, experts, strict=True):
@@ -188,8 +189,8 @@ def fly_shard(task: ShardTask) -> FlownShard:
     return FlownShard(shard.name, states, time.process_time() - begun_s)
 
 
-class _Deciding:
-    """See `Agents`: in some of the worlds the expert decides instead of the policy, and is mute."""
+class _MixedAgents:
+    """See `Agents`: the expert decides in some worlds, and sends payloads of zeros."""
 
     def __init__(self, by_expert: Sequence[bool]) -> None:
         self._by_expert = by_expert
@@ -197,12 +198,12 @@ class _Deciding:
         self._robot_of: list[int] = []
 
     def of(self, bundle: Bundle, perceptions: Sequence[PerceptionParameters]) -> Agents:
-        """This, for a bundle whose policy decides in the other worlds."""
+        """Use this bundle's policy in the other worlds; returns self."""
         self._policy = make_agents(bundle, perceptions)
         return self
 
     def watch(self, flights: BatchedFlights, experts: Sequence[Teacher]) -> None:
-        """Take the flights and the experts, before anybody decides."""
+        """Set the flights and their experts, before the first step."""
         self._flights = flights
         self._experts = experts
         for world, prepared in enumerate(flights.prepared):
@@ -235,7 +236,7 @@ class _Deciding:
         degrees: Sequence[int],
     ) -> PolicySteps:
         velocities = np.zeros((len(robots), 2), np.float32)
-        said = np.zeros((len(robots), self.message_size), np.float32)
+        payloads_out = np.zeros((len(robots), self.message_size), np.float32)
         deciding = self._by_policy(robots)
         if deciding:
             steps = self._policy.step(
@@ -244,14 +245,16 @@ class _Deciding:
                 [payloads[i] for i in deciding],
                 [degrees[i] for i in deciding],
             )
-            velocities[deciding], said[deciding] = steps
+            velocities[deciding], payloads_out[deciding] = steps
         by_expert: dict[int, list[int]] = {}
         for i, agent in enumerate(robots):
             if self._by_expert[self._world_of[agent]]:
                 by_expert.setdefault(self._world_of[agent], []).append(i)
         for world, its in by_expert.items():
-            velocities[its] = self._told(world, [self._robot_of[robots[i]] for i in its])
-        return PolicySteps(velocities, said)
+            velocities[its] = self._expert_velocities(
+                world, [self._robot_of[robots[i]] for i in its]
+            )
+        return PolicySteps(velocities, payloads_out)
 
     def reset(self, robot: int) -> None:
         self._policy.reset(robot)
@@ -259,8 +262,8 @@ class _Deciding:
     def _by_policy(self, robots: Sequence[int]) -> list[int]:
         return [i for i, agent in enumerate(robots) if not self._by_expert[self._world_of[agent]]]
 
-    def _told(self, world: int, robots: Sequence[int]) -> F64:
-        """By the expert to these robots, where the world's robots are now."""
+    def _expert_velocities(self, world: int, robots: Sequence[int]) -> F64:
+        """The expert's velocities for these robots at the present positions."""
         swarm, scenario = self._flights.swarms[world], self._flights.prepared[world].scenario
         return self._experts[world].velocities(
             scenario.scale.position_to_model(swarm.positions_m()),
@@ -270,8 +273,8 @@ class _Deciding:
         )
 
 
-class _Kept:
-    """States as they come."""
+class _StateBuffer:
+    """Collects states."""
 
     def __init__(self) -> None:
         self._inputs: list[Inputs] = []
@@ -303,6 +306,6 @@ class _Kept:
 
 
 def _stored(arrays: Sequence[F32]) -> npt.NDArray[np.floating]:
-    """(R, ...): images, of more than one dimension, in half the space."""
+    """Concatenate to (R, ...); images, of more than one dimension, become float16."""
     rows = np.concatenate(arrays)
     return rows.astype(np.float16) if rows.ndim > 2 else rows

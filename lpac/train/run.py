@@ -1,7 +1,7 @@
-"""A training from its configuration to a policy, in a folder that it can go on in.
+"""Runs a training from its configuration to a policy, in a folder from which it can continue.
 
-For each round: generate (the expert flies, then the policy), fit, and now and then select; at the
-end export. What is done is on disk, and is not done again.
+Each round generates data (flown by the expert, later by the policy), fits, and selects at
+intervals; the end exports. Finished work is on disk and is not repeated.
 """
 
 import platform
@@ -35,28 +35,30 @@ from lpac.train.select import (
 )
 
 _CONFIG, _CHECKPOINT, _BUNDLE = "config.toml", "checkpoint.pt", "bundle"
-# The payload limit is so many times the largest number in a payload of this many flights.
+# The payload limit is this multiple of the largest number in a payload of this many flights.
 _PAYLOAD_MARGIN = 10.0
 _PAYLOAD_FLIGHTS = 16
-# With int8 payloads robots may fly if that costs no more than this.
-_MOST_WORSE = 1.01
+# Robots may use int8 payloads if the cost rises by no more than this factor.
+_MAX_COST_RATIO = 1.01
 
 
 def require_same_run(read: ReadConfig, folder: Path) -> None:
-    """That whatever was begun in the folder can go on so. Raises ConfigError, OSError."""
+    """Check that a run in the folder can continue with `read`. Raises ConfigError, OSError."""
     begun = folder / _CONFIG
     if begun.exists() and config_digest(begun.read_text("utf-8")) != read.digest:
         raise ConfigError(
-            f"{folder}: was begun with another configuration ({begun}); only dagger.rounds may "
+            f"{folder}: has a run of another configuration ({begun}); only dagger.rounds may "
             "change: choose another name, or --out"
         )
 
 
 class TrainingRun:
-    """One folder's training."""
+    """The training in one folder."""
 
-    def __init__(self, read: ReadConfig, folder: Path, tell: Callable[[RunProgress], None]) -> None:
-        """Begins, or goes on. Raises ConfigError if it was begun otherwise; ValueError, OSError."""
+    def __init__(
+        self, read: ReadConfig, folder: Path, report: Callable[[RunProgress], None]
+    ) -> None:
+        """Begin or continue. Raises ConfigError for another configuration; ValueError, OSError."""
         self._config, self._network, self._folder = read.config, read.network, folder
         self._digest = read.digest
         require_same_run(read, folder)
@@ -71,17 +73,17 @@ class TrainingRun:
             plan_round(config.data, config.dagger, config.seed, round_)
             for round_ in range(config.dagger.rounds + 1)
         ]
-        self._work = self._planned(tell)
+        self._work = self._plan_work(report)
 
     def run(self, pool: Pool) -> dict[str, Any]:
-        """Train; gives what came out, for JSON. Raises ValueError, OSError."""
+        """Train; returns the results, for JSON. Raises ValueError, OSError."""
         for round_ in range(self._config.dagger.rounds + 1):
             self._generate(round_, pool)
             self._train(round_, pool)
         return self._export(pool)
 
-    def _planned(self, tell: Callable[[RunProgress], None]) -> Work:
-        """Robots times seconds to fly, robots times epochs to fit, and flights to select by."""
+    def _plan_work(self, report: Callable[[RunProgress], None]) -> Work:
+        """Units: robot seconds to fly, robot epochs to fit, flights to select."""
         config, robots, fit = self._config, 0, 0
         judged = len(config.select.set_ups) * config.select.worlds
         flights = 0
@@ -90,7 +92,7 @@ class TrainingRun:
             fit += robots * self._fit.epochs(round_)
             flights += len(self._candidates(round_)) * judged
         flown = sum(map(_robot_seconds, (shard for plan in self._plans for shard in plan)))
-        work = Work({"generate": flown, "fit": fit, "select": flights}, tell)
+        work = Work({"generate": flown, "fit": fit, "select": flights}, report)
         work.skip("select", judged * len(self._selection.judged))
         return work
 
@@ -98,14 +100,14 @@ class TrainingRun:
         return candidates_of(round_, self._fit.epochs(round_), self._config.select.every_epochs)
 
     def _generate(self, round_: int, pool: Pool) -> None:
-        there, work = self._shards.facts, self._work
-        missing = {shard.name: shard for shard in self._plans[round_] if shard.name not in there}
+        finished, work = self._shards.facts, self._work
+        missing = {shard.name: shard for shard in self._plans[round_] if shard.name not in finished}
         for shard in self._plans[round_]:
-            if shard.name in there:
+            if shard.name in finished:
                 work.skip("generate", _robot_seconds(shard))
         if not missing:
             return
-        bundle = self._flying(round_)
+        bundle = self._flight_bundle(round_)
         tasks = [ShardTask(shard, bundle, self._network.task) for shard in missing.values()]
         work.begin()
         work.show("generate", round_)
@@ -123,10 +125,10 @@ class TrainingRun:
                 self._shards.add(name, states, facts)
                 work.add("generate", round_, _robot_seconds(shard))
 
-    def _flying(self, round_: int) -> Bundle:
-        """Bundle that flies in a round: at first none does, but all perceive as this one says."""
+    def _flight_bundle(self, round_: int) -> Bundle:
+        """Bundle of a round's flights. In round 0 it only defines the inputs."""
         if round_:
-            return load_bundle(self._of(self._candidates(round_ - 1)[-1]) / _BUNDLE)
+            return load_bundle(self._candidate_folder(self._candidates(round_ - 1)[-1]) / _BUNDLE)
         checkpoint = self._network.checkpoint(self._fit.untrained())
         return self._network.bundle(
             checkpoint, self._config.parameters, self._config.export.name, {"training": "none"}
@@ -135,32 +137,32 @@ class TrainingRun:
     def _train(self, round_: int, pool: Pool) -> None:
         work, candidates = self._work, self._candidates(round_)
         data = None
-        of_all = self._fit.epochs(round_)
+        epochs = self._fit.epochs(round_)
         robots = sum(map(_robots, (s for plan in self._plans[: round_ + 1] for s in plan)))
-        units = float(robots * self._config.data.states * of_all)
-        done = self._fit.done(round_) / of_all
+        units = float(robots * self._config.data.states * epochs)
+        done = self._fit.done(round_) / epochs
         work.skip("fit", units * done)
         for candidate in candidates:
             if self._fit.done(round_) < candidate.epoch:
                 data = data or self._shards.load(round_)
                 work.begin()
 
-                def tell(share: float, loss: float) -> None:
+                def report(share: float, loss: float) -> None:
                     nonlocal done
                     work.loss = loss
                     work.add("fit", round_, units * (share - done))
                     done = share
 
-                self._fit.run(data, round_, candidate.epoch, tell)
-            folder = self._of(candidate)
+                self._fit.run(data, round_, candidate.epoch, report)
+            folder = self._candidate_folder(candidate)
             if not (folder / _BUNDLE).exists():
                 self._write_candidate(candidate)
             self._judge(candidate, pool)
 
     def _write_candidate(self, candidate: Candidate) -> None:
-        """The bundle is last: a candidate that has one is complete."""
+        """Write a candidate. The bundle comes last, and marks it as complete."""
         checkpoint = self._network.checkpoint(self._fit.weights)
-        folder = self._of(candidate)
+        folder = self._candidate_folder(candidate)
         write_atomically(folder / _CHECKPOINT, checkpoint)
         write_bundle(self._bundle(candidate, checkpoint, PolicyMessages()), folder / _BUNDLE)
 
@@ -173,20 +175,20 @@ class TrainingRun:
         return self._network.bundle(checkpoint, parameters, self._config.export.name, provenance)
 
     def _judge(self, candidate: Candidate, pool: Pool) -> None:
-        work, path, flown = self._work, self._of(candidate) / _BUNDLE, 0
+        work, path, flown = self._work, self._candidate_folder(candidate) / _BUNDLE, 0
         bundle = load_bundle(path)
         work.begin()
 
-        def tell(flights: int) -> None:
+        def report(flights: int) -> None:
             nonlocal flown
             work.add("select", candidate.round, flights - flown)
             flown = flights
 
-        self._selection.judge(candidate, path, bundle, pool, tell)
+        self._selection.judge(candidate, path, bundle, pool, report)
         best = self._selection.best
         work.cost = best.cost.mean if best else None
 
-    def _of(self, candidate: Candidate) -> Path:
+    def _candidate_folder(self, candidate: Candidate) -> Path:
         return self._folder / "candidates" / candidate.name
 
     def _export(self, pool: Pool) -> dict[str, Any]:
@@ -194,13 +196,13 @@ class TrainingRun:
         best = self._selection.best
         assert best is not None
         self._work.show("export", best.candidate.round)
-        folder = self._of(best.candidate)
+        folder = self._candidate_folder(best.candidate)
         judged = load_bundle(folder / _BUNDLE)
         baselines = self._selection.baselines(folder / _BUNDLE, pool)
         checkpoint = (folder / _CHECKPOINT).read_bytes()
         limit = _PAYLOAD_MARGIN * self._largest_payload(judged, pool)
         int8 = self._selection.with_payload("int8", folder / _BUNDLE, judged, pool)
-        worse = int8.mean > _MOST_WORSE * best.cost.mean
+        worse = int8.mean > _MAX_COST_RATIO * best.cost.mean
         messages = PolicyMessages(
             limit if limit > 0.0 else None, FLOAT_PAYLOADS if worse else PAYLOAD_TYPES
         )
@@ -246,7 +248,7 @@ class TrainingRun:
         }
 
     def _largest_payload(self, bundle: Bundle, pool: Pool) -> float:
-        """The largest number in a payload of the first flights of the data, flown by the policy."""
+        """Largest number in a payload of the first flights of round 0, flown by the policy."""
         scenarios = [scenario for shard in self._plans[0] for scenario in shard.scenarios]
         shards = [
             replace(

@@ -1,4 +1,4 @@
-"""Which weights are best: by the cost that they fly to over validation worlds, and nothing else."""
+"""Selects weights by their closed-loop cost over validation worlds."""
 
 import time
 from collections.abc import Callable
@@ -22,19 +22,19 @@ from lpac.train.task import Task
 
 
 class Candidate(NamedTuple):
-    """The weights after so many epochs of a round."""
+    """The weights after `epoch` epochs of a round."""
 
     round: int
     epoch: int
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of the candidate's folder."""
         return f"{self.round:02d}-{self.epoch:04d}"
 
 
 class ClosedLoopCost(NamedTuple):
-    """Over the worlds: cost at the end over that at the start."""
+    """Final cost over initial cost, over the worlds."""
 
     mean: float
     p90: float
@@ -43,7 +43,7 @@ class ClosedLoopCost(NamedTuple):
 
     @classmethod
     def of(cls, costs: F64) -> "ClosedLoopCost":
-        """Of (flights,)."""
+        """Summarise `costs` (flights,)."""
         return cls(
             float(costs.mean()), float(np.quantile(costs, 0.9)), float(costs.max()),
             int(costs.argmax()),
@@ -51,28 +51,28 @@ class ClosedLoopCost(NamedTuple):
 
 
 class JudgedCandidate(NamedTuple):
-    """A candidate, and how it flew."""
+    """A candidate and its cost."""
 
     candidate: Candidate
     cost: ClosedLoopCost
 
 
 def candidates_of(round_: int, epochs: int, every: int) -> list[Candidate]:
-    """Those of a round: after every so many epochs, and after the last."""
+    """Candidates of a round: every `every` epochs, and the last."""
     return [Candidate(round_, epoch) for epoch in sorted({*range(every, epochs, every), epochs})]
 
 
 def policy_of(path: Path, bundle: Bundle) -> Method:
-    """The one that was trained."""
+    """The trained policy as a method of a study."""
     return Method(name="lpac", trainings=(TrainedBundle(str(path.resolve()), bundle.id),))
 
 
 def flights_of(
     select: SelectConfig, method: Method, sizes_from: Path, payload: PayloadType = "float16"
 ) -> list[PlannedFlight]:
-    """The flights by which a policy is judged, or a baseline that has the sizes of a bundle.
+    """Flights over validation worlds that evaluate a policy, or a baseline at a bundle's sizes.
 
-    They are over validation worlds. Baselines lose no messages.
+    Baselines lose no messages.
     """
     conditions = [
         Condition(
@@ -97,10 +97,10 @@ def flights_of(
 
 
 class Selection:
-    """The candidates of a run that were judged; kept in a folder."""
+    """The evaluated candidates of a run, saved in a folder."""
 
     def __init__(self, folder: Path, config: str, select: SelectConfig, task: Task) -> None:
-        """`config` is the digest of the run's. Raises OSError."""
+        """`config` is the digest of the run's configuration. Raises OSError."""
         self._select = select
         self._task = task
         self._flights = KeptFlights(folder, CostCurve)
@@ -116,12 +116,12 @@ class Selection:
 
     @property
     def best(self) -> JudgedCandidate | None:
-        """That of the least mean cost, the earlier of two."""
+        """The candidate of least mean cost, the earlier one in a tie."""
         return min(self.judged, key=lambda judged: judged.cost.mean, default=None)
 
     @property
     def seconds(self) -> float:
-        """Time that judging took."""
+        """Time of all evaluations."""
         return float(sum(line["seconds"] for line in self._kept.lines))
 
     def judge(
@@ -130,13 +130,13 @@ class Selection:
         path: Path,
         bundle: Bundle,
         pool: Pool,
-        tell: Callable[[int], None],
+        report: Callable[[int], None],
     ) -> None:
-        """Fly it, unless it was; `tell` is called with the number of flights that are done."""
+        """Fly a candidate, unless done before; calls `report` with the number of flights done."""
         if any(judged.candidate == candidate for judged in self.judged):
             return
         begun_s = time.monotonic()
-        costs = self._fly(flights_of(self._select, policy_of(path, bundle), path), pool, tell)
+        costs = self._fly(flights_of(self._select, policy_of(path, bundle), path), pool, report)
         self._kept.add(
             {
                 "candidate": list(candidate),
@@ -147,7 +147,7 @@ class Selection:
         )
 
     def baselines(self, path: Path, pool: Pool) -> dict[BaselineName, ClosedLoopCost]:
-        """Over the same worlds, with the sizes of the bundle at `path`."""
+        """Costs over the same worlds, with the sizes of the bundle at `path`."""
         names = self._task.baselines
         if not names:
             return {}
@@ -160,15 +160,15 @@ class Selection:
     def with_payload(
         self, payload: PayloadType, path: Path, bundle: Bundle, pool: Pool
     ) -> ClosedLoopCost:
-        """The same flights, with messages that are encoded so."""
+        """Cost of the same flights with another payload type."""
         flights = flights_of(self._select, policy_of(path, bundle), path, payload)
         return ClosedLoopCost.of(self._fly(flights, pool, lambda _: None))
 
-    def _fly(self, flights: list[PlannedFlight], pool: Pool, tell: Callable[[int], None]) -> F64:
-        """The cost of each at the end, over that at the start."""
+    def _fly(self, flights: list[PlannedFlight], pool: Pool, report: Callable[[int], None]) -> F64:
+        """Final cost over initial cost of each flight."""
         flown: dict[PlannedFlight, float] = {}
         with closing(self._flights.fly(self._task.costs, flights, pool)) as outcomes:
-            for flight, told in outcomes:
-                flown[flight] = told.cost[-1] / told.cost[0]
-                tell(len(flown))
+            for flight, curve in outcomes:
+                flown[flight] = curve.cost[-1] / curve.cost[0]
+                report(len(flown))
         return np.array([flown[flight] for flight in flights])

@@ -1,6 +1,6 @@
-"""Training task of a family: its expert, and what a good flight is.
+"""Training task of a family: its expert, and the cost of a flight.
 
-Processes that fly have it, so that this module, and a task's own, load no torch.
+Tasks are sent to the processes that fly, so their modules must not import torch.
 """
 
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from lpac.train.expert import Expert, make_expert
 
 
 class Teacher(Protocol):
-    """Expert in one world; it knows where all robots truly are, and how they move."""
+    """Expert in one world, which knows all robots' true positions and velocities."""
 
     def look(self, positions: F64, alive: Bools) -> None:
-        """Take notice of what the robots at `positions` (N, 2) see that are left."""
+        """Update what the robots at `positions` (N, 2) that are `alive` have seen."""
 
     def velocities(
         self,
@@ -27,43 +27,43 @@ class Teacher(Protocol):
         robots: Sequence[int] | None = None,
         moving: F64 | None = None,
     ) -> F64:
-        """Velocities that `robots` (m,), or all N, should fly: (m, 2); 0 of those not left.
+        """Velocities (m, 2) that `robots` (m,), or all N, should fly; 0 for failed ones.
 
-        They are at true positions (N, 2) and fly `moving` (N, 2), in model units and model units/s;
-        None: they stand.
+        `positions` (N, 2) are true positions in model units, `moving` (N, 2) the present velocities
+        in model units/s, None if all robots stand still.
         """
 
 
 class Task(Protocol):
-    """Training task: the expert that networks imitate, and what a good flight is.
+    """Training task: the expert to imitate, and the cost of a flight.
 
-    Can be pickled.
+    Must support pickle.
     """
 
     @property
     def baselines(self) -> Sequence[BaselineName]:
-        """Baselines in the model card, over the same worlds; may be none."""
+        """Baselines in the model card, over the same worlds; may be empty."""
 
     def expert_name(self, data: DataConfig) -> str:
         """Name of the expert, for the model card."""
 
     def teacher(self, data: DataConfig, world: Preparation) -> Teacher:
-        """A new one, for that world."""
+        """Make the expert for a world."""
 
     def costs(self, flights: FlightGroup) -> list[tuple[PlannedFlight, CostCurve]]:
-        """Fly them; policies are chosen by the cost at the end over that at the start.
+        """Fly them. Policies are selected by final cost over initial cost.
 
         Raises BundleError, ValueError, OSError.
         """
 
 
 CLAIRVOYANT: BaselineName = "clairvoyant-cvt"
-# Beside the one that knows all.
+# In addition to the clairvoyant one.
 BASELINES: tuple[BaselineName, ...] = ("decentralized-cvt", "decentralized-cvt-prior")
 
 
 class CoverageTask(NamedTuple):
-    """The paper's: see `Task`."""
+    """The paper's task: see `Task`."""
 
     @property
     def baselines(self) -> Sequence[BaselineName]:

@@ -112,7 +112,7 @@ def test_another_configuration_is_another_ablation(
 ) -> None:
     """It says so before anything is trained."""
     other = read_ablation(written(tmp_path, ("hops = 0", "hops = 2")))
-    with pytest.raises(ConfigError, match=r"no-features-0: was begun with another configuration"):
+    with pytest.raises(ConfigError, match=r"no-features-0: has a run of another configuration"):
         AblationRun(other, ablated[0], quiet)
 
 

@@ -1,4 +1,4 @@
-"""What cannot be trained is one line that names key, value and what is allowed."""
+"""An invalid configuration gives one line with key, value and what is allowed."""
 
 from pathlib import Path
 

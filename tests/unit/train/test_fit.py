@@ -1,4 +1,4 @@
-"""Imitation: it learns what can be seen, and says so where it cannot go on."""
+"""Imitation learns from the inputs, and reports why it cannot continue."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ NETWORK = LpacNetwork(
 
 
 def states(count: int, robots: int = 3) -> Dataset:
-    """The expert goes to the middle of the world: that is seen in the position alone."""
+    """States in which the expert goes to the world's centre: the position tells its action."""
     rng = np.random.default_rng(0)
     rows = count * robots
     position = rng.uniform(0.5, 1.5, (rows, 2)).astype(np.float32)
@@ -66,12 +66,12 @@ def test_a_loss_that_is_not_finite_is_one_line(tmp_path: Path) -> None:
 
 def test_a_broken_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "fit.pt").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"fit\.pt: cannot be gone on with"):
+    with pytest.raises(ValueError, match=r"fit\.pt: cannot continue from this file"):
         fit(tmp_path / "fit.pt", 1)
 
 
 def test_what_cannot_be_written_leaves_what_was(tmp_path: Path) -> None:
-    """A folder in the new file's place stands for a full disk."""
+    """A folder in place of the new file stands for a full disk."""
     data = states(20)
     fit(tmp_path / "fit.pt", 2).run(data, 0, 1, lambda share, loss: None)
     before = (tmp_path / "fit.pt").read_bytes()

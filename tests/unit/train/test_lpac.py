@@ -1,4 +1,4 @@
-"""The network that is trained is the one that flies."""
+"""The trained network equals the one that flies."""
 
 import io
 from dataclasses import replace
@@ -28,7 +28,7 @@ MEAN, DEVIATION = np.array([0.1, -0.2], np.float32), np.array([1.5, 2.5], np.flo
 
 
 def drawn(sizes: LpacNetwork, seed: int = 0) -> LpacModule:
-    """A module whose batch norms have seen data."""
+    """A module with trained batch norms."""
     torch.manual_seed(seed)
     module = sizes.module(MEAN, DEVIATION)
     for name, buffer in module.named_buffers():
@@ -40,7 +40,7 @@ def drawn(sizes: LpacNetwork, seed: int = 0) -> LpacModule:
 
 
 def swarm(sizes: LpacNetwork, robots: int, seed: int = 0) -> tuple[dict[str, F32], Bools]:
-    """Inputs, and who hears whom; the last robot is alone."""
+    """Inputs and adjacency; the last robot is alone."""
     rng = np.random.default_rng(seed)
     adjacency = rng.random((robots, robots)) < 0.6
     adjacency = np.triu(adjacency, 1) | np.triu(adjacency, 1).T
@@ -133,7 +133,7 @@ def test_who_is_not_heard_is_still_a_neighbour() -> None:
 
 @given(turned=st.integers(0, 7), channels=st.sampled_from([4, 5]), seed=st.integers(0, 99))
 def test_symmetries_are_those_of_the_images(turned: int, channels: int, seed: int) -> None:
-    """What a robot perceives in a mirrored world is the mirrored image of what it perceived."""
+    """Inputs in a mirrored world are the mirrored inputs."""
     parameters = read_parameters(SHIPPED.with_suffix(".toml")).perception
     size, rng = parameters.world_size, np.random.default_rng(seed)
     position, others = rng.integers(0, size, 2) * 1.0, rng.uniform(0, size, (3, 2))
@@ -191,7 +191,7 @@ def test_it_can_go_on_with_the_shipped_policys_weights() -> None:
 
 
 def test_without_hops_nobody_heeds_what_is_said() -> None:
-    """Trained or not; and what flies is a network of one hop."""
+    """Trained or not; the bundle has a network of one hop."""
     sizes = replace(SMALL, hops=0)
     module = drawn(sizes)
     optimiser = torch.optim.AdamW(module.parameters(), lr=0.1)
@@ -210,7 +210,7 @@ def test_without_hops_nobody_heeds_what_is_said() -> None:
     )
     bundle = sizes.bundle(content, read_parameters(SHIPPED.with_suffix(".toml")), "small", {})
     assert all(check.passed for check in LpacPolicy(bundle).verify())
-    with pytest.raises(ValueError, match=r"small\.pt: weights of hops are of no use"):
+    with pytest.raises(ValueError, match=r"small\.pt: a network of hops = 0 cannot use"):
         sizes.initial(content, "small.pt")
 
 
@@ -223,7 +223,10 @@ def test_without_hops_nobody_heeds_what_is_said() -> None:
         ({"cnn_channels": []}, r"here: cnn_channels = \[\]: must be at least 1 long"),
         ({"hops": -1}, "here: hops = -1: must be at least 0"),
         ({"layers": 0}, "here: layers = 0: must be at least 1"),
-        ({"image_size": 6}, "here: image_size = 6: must be above 6, what the convolutions"),
+        (
+            {"image_size": 6},
+            "here: image_size = 6: must be above 6, the border that the convolutions",
+        ),
     ],
 )
 def test_networks_that_cannot_be(network_table: dict[str, object], text: str) -> None:
@@ -236,7 +239,7 @@ def test_networks_that_cannot_be(network_table: dict[str, object], text: str) ->
 
 @pytest.mark.parametrize("batches", [True, False])
 def test_a_checkpoint_without_the_explored_image_is_gone_on_with(batches: bool) -> None:
-    """Whatever that image shows, at first the wider network does what the narrower one does."""
+    """The wider network first computes the same as the narrower one, whatever the new image."""
     module = drawn(SMALL)
     state = {
         name: tensor

@@ -1,4 +1,4 @@
-"""How far it is, and how long it still takes."""
+"""Progress and remaining time."""
 
 import pytest
 
@@ -17,7 +17,7 @@ def test_time_left_is_known_once_each_stage_was_seen() -> None:
     work.loss = 0.5
     now = 30.0
     work.add("fit", 0, 50.0)
-    # What is not timed is not counted: somebody waited.
+    # Time outside of begin() and add() does not count, such as waiting.
     now = 1000.0
     work.begin()
     now = 1001.0

@@ -1,4 +1,4 @@
-"""What is flown for data, and by whom; what is kept of it."""
+"""Flights for data: their scenarios, their pilots, and their stored states."""
 
 from dataclasses import replace
 from itertools import permutations
@@ -92,7 +92,7 @@ def test_draws_are_within_the_ranges(seed: int, robots: int) -> None:
 def test_states_are_what_robots_perceive_and_the_expert_says(
     states: States, shard: PlannedShard, shipped_bundle: Bundle
 ) -> None:
-    """As the policy flies: what it perceives, and what the expert would do instead."""
+    """The policy flies and perceives; the expert's velocities are stored."""
     by_policy = replace(shard, by_expert=(False,) * len(shard.scenarios))
     kept = fly_shard(ShardTask(by_policy, shipped_bundle)).states
     flights = BatchedFlights(shard.scenarios, shipped_bundle)
@@ -122,12 +122,12 @@ def test_the_expert_covers_better_than_it_began(
     longer = replace(shard.scenarios[0], duration_s=30.0)
     task = replace(shard, scenarios=(longer,), by_expert=(True,), times_s=(1.0, 25.0))
     first, last = fly_shard(ShardTask(task, shipped_bundle)).states.velocities.reshape(2, 10, 2)
-    # It is nearly where it wants to be.
+    # It has nearly reached its goals.
     assert np.linalg.norm(last, axis=1).mean() < 0.2 * np.linalg.norm(first, axis=1).mean()
 
 
 def test_who_decides_changes_nothing_else(shard: PlannedShard, shipped_bundle: Bundle) -> None:
-    """The policy's flights come out as the simulator has them without us, payloads too."""
+    """The policy's flights equal those of the simulator, including payloads."""
     by_policy = replace(
         shard, by_expert=(False,) * len(shard.scenarios), times_s=(DATA.duration_s,)
     )
@@ -163,7 +163,7 @@ def test_what_overshoots_is_flown_no_faster(shard: PlannedShard, shipped_bundle:
         told = fly_shard(ShardTask(task, shipped_bundle)).states.velocities
         ends[overshoot] = np.linalg.norm(told, axis=1)
     assert ends[1.0].max() == pytest.approx(5.0) and 5.0 < ends[3.0].max() <= 15.0 + 1e-5
-    # Both have flown the same until then: what is slower than max_speed is told alike.
+    # Both flights are equal until then: slower velocities than max_speed are equal.
     slow = ends[1.0] < 5.0 - 1e-5
     np.testing.assert_allclose(ends[3.0][slow], ends[1.0][slow])
 
@@ -184,7 +184,7 @@ def test_the_best_of_lloyd_ends_below_the_clairvoyant(shipped_bundle: Bundle) ->
 
 
 class FineCentroids(NamedTuple):
-    """ClairvoyantCVT's."""
+    """ClairvoyantCVT's centroids on the fine raster."""
 
     importance: F32
 
@@ -196,7 +196,7 @@ class FineCentroids(NamedTuple):
 
 
 def test_who_explores_ends_about_as_well_as_who_knows(shipped_bundle: Bundle) -> None:
-    """And without jumps: who stands a little further is told nearly the same."""
+    """And its goals are continuous: a small step changes them little."""
     everybody = np.ones(10, np.bool_)
     ends: dict[ExpertName, float] = {}
     largest = 0.0
@@ -236,7 +236,7 @@ def test_the_coarse_raster_is_good_enough(shipped_bundle: Bundle) -> None:
         positions = rng.uniform(0, 512, (10, 2))
         by_exact = by_ours = positions
         for _ in range(25):
-            # Far from the goals all go as fast: where they nearly are, the velocities tell it.
+            # Far from its goal a robot flies at full speed: velocities differ only near the goals.
             difference = ours.velocities(by_exact, everybody) - exact.velocities(
                 by_exact, everybody
             )
@@ -275,7 +275,7 @@ def test_a_broken_shard_is_one_line(states: States, tmp_path: Path) -> None:
     shards = Shards(tmp_path, "config")
     shards.add("00-0000", states, {})
     (tmp_path / "00-0000.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"00-0000\.npz: cannot be read"):
+    with pytest.raises(ValueError, match=r"00-0000\.npz: unreadable shard"):
         shards.load(0)
 
 

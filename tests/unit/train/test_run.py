@@ -1,4 +1,4 @@
-"""A whole training of seconds: stopped anywhere it goes on, and comes to the same."""
+"""A whole training in seconds: stopped at any point, it continues to the same result."""
 
 import json
 from collections.abc import Callable, Generator, Sequence
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 
 class StoppedError(Exception):
-    """Somebody stopped it."""
+    """Stops a training."""
 
 
 def quiet(now: RunProgress) -> None:
@@ -40,7 +40,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """What comes of it if nobody stops it."""
+    """Results of an uninterrupted training."""
     folder = tmp_path_factory.mktemp("trained")
     return folder / "run", TrainingRun(read(folder), folder / "run", quiet).run(here)
 
@@ -68,7 +68,7 @@ def test_its_candidates_flew_over_validation_worlds_only(
         json.loads(line)["seed"]
         for line in (trained[0] / "flights.jsonl").read_text().splitlines()[1:]
     ]
-    # Three candidates, the best of them with int8 payloads, and three baselines, over two worlds.
+    # Three candidates, the best one with int8 payloads, and three baselines, over two worlds.
     seeds = {draw_world("validation", world, FIELD).seed for world in range(2)}
     assert len(flown) == 14 and set(flown) == seeds
 
@@ -100,8 +100,8 @@ def test_a_network_that_sees_what_was_explored_is_trained_alike(tmp_path: Path) 
 def test_stopped_anywhere_it_goes_on_and_comes_to_the_same(
     trained: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between shards, batches and flights, each time a little later."""
-    monkeypatch.setattr("lpac.train.fit._KEPT_EVERY_S", 0.0)
+    """Stop between shards, batches and flights, each time a little later."""
+    monkeypatch.setattr("lpac.train.fit._SAVE_PERIOD_S", 0.0)
     config, folder = read(tmp_path), tmp_path / "run"
     for stops in count():
         told = 0
@@ -157,7 +157,7 @@ def test_a_killed_worker_costs_one_shard(tmp_path: Path) -> None:
 def test_another_configuration_is_another_run(
     trained: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match=r"was begun with another configuration .*config\.toml"):
+    with pytest.raises(ConfigError, match=r"has a run of another configuration .*config\.toml"):
         TrainingRun(read(tmp_path, ("states = 3", "states = 4")), trained[0], quiet)
 
 
