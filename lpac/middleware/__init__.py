@@ -1,8 +1,7 @@
-"""The paper's experiments on the network: throughput while programs restart, and over robots.
+"""The paper's network experiments: throughput while programs restart, and over robots.
 
-What speaks and what is measured are programs of their own, as on robots: at each place one that
-is a robot (`robot`) and, at two of them, the ends of a bulk stream (`stream`). `places` starts
-them, on this machine's loopback or in network namespaces, and `measure` makes the runs. A
-middleware is an adapter of two calls (`kinds`, `over_zenoh`, `over_cyclone`). What runs came
-to is pure (`results`).
+Senders and meters are separate processes, as on robots: one robot (`robot`) at each place and, at
+two of them, the ends of a bulk stream (`stream`). `places` starts them on this machine's loopback
+or in network namespaces; `measure` makes the runs. Each middleware has a small adapter (`kinds`,
+`over_zenoh`, `over_cyclone`, `over_fastdds`). `results` evaluates the runs.
 """

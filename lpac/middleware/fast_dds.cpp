@@ -1,5 +1,5 @@
-// A robot over Fast DDS 2, with the qualities of service that ROS 2 has by default, for
-// over_fastdds.py, which compiles it where Fast DDS is installed.
+// Adapter of Fast DDS 2, with ROS 2's default quality of service, for over_fastdds.py, which
+// compiles it where Fast DDS is installed.
 
 #include <chrono>
 #include <cstdint>
@@ -27,12 +27,12 @@ namespace rtps = eprosima::fastrtps::rtps;
 namespace {
 
 constexpr std::uint32_t kMostBytes = 1 << 20;
-// CDR's own header, and the length of what comes.
+// CDR header, and the payload's length.
 constexpr std::uint32_t kHeadBytes = 8;
 
 using Bytes = std::vector<std::uint8_t>;
 
-// What a message is to DDS: a sequence of octets, as CDR has it.
+// A message as a DDS type: a CDR sequence of octets.
 class BytesType : public fast::TopicDataType {
  public:
   BytesType() {
@@ -99,7 +99,7 @@ struct Peer {
 
   bool open(std::uint32_t domain, const std::string& address, const char* const* topics, int count) {
     fast::DomainParticipantQos qos;
-    // Robots of one computer would share memory, and leave the network out.
+    // Shared memory between robots of one computer would bypass the network.
     auto udp = std::make_shared<eprosima::fastdds::rtps::UDPv4TransportDescriptor>();
     udp->interfaceWhiteList.push_back(address);
     qos.transport().use_builtin_transports = false;
@@ -111,7 +111,7 @@ struct Peer {
     fast::Publisher* publisher = participant->create_publisher(fast::PUBLISHER_QOS_DEFAULT);
     fast::Subscriber* subscriber = participant->create_subscriber(fast::SUBSCRIBER_QOS_DEFAULT);
     if (publisher == nullptr || subscriber == nullptr) return false;
-    // As many as the product's robots declare; on the first one it speaks and hears.
+    // All topics of a robot are declared, as on real robots; only the first is used.
     for (int i = 0; i < count; ++i) {
       fast::Topic* topic =
           participant->create_topic(topics[i], type.get_type_name(), fast::TOPIC_QOS_DEFAULT);
@@ -148,14 +148,14 @@ int fast_dds_publish(Peer* peer, const std::uint8_t* data, std::uint32_t size) {
   return peer->writer->write(&bytes) ? 1 : 0;
 }
 
-// The next message's size; 0 if none comes within that time, -1 if `size` is less.
+// Size of the next message; 0 after the timeout, -1 if it is larger than `size`.
 int fast_dds_take(Peer* peer, std::uint8_t* data, std::uint32_t size, std::uint32_t timeout_ms) {
   const auto until = std::chrono::steady_clock::now() + std::chrono::milliseconds(timeout_ms);
   Bytes bytes;
   fast::SampleInfo info;
   for (;;) {
     while (peer->reader->take_next_sample(&bytes, &info) == ReturnCode_t::RETCODE_OK) {
-      // Else it is the news that a writer has gone.
+      // Otherwise the sample announces the end of a writer.
       if (!info.valid_data) continue;
       if (bytes.size() > size) return -1;
       std::memcpy(data, bytes.data(), bytes.size());

@@ -1,4 +1,4 @@
-"""Figures of what was measured: one for each experiment."""
+"""Figures of the measurements, one per experiment."""
 
 from collections.abc import Sequence
 
@@ -13,13 +13,13 @@ _JITTER = 0.12
 
 
 def title_of(middleware: str) -> str:
-    """As people write it."""
+    """The middleware's name for people."""
     known = MIDDLEWARES.get(middleware)
     return middleware if known is None else known.title
 
 
 def of_restarts(runs: Sequence[Run]) -> Figure:
-    """A dot for each run, and the mean with the standard deviation of each middleware."""
+    """A dot for each run, and each middleware's mean and standard deviation."""
     with style.figure(style.WIDTH_IN, 2.4) as figure:
         panels = figure.subplots(1, 3)
         measures = (
@@ -58,7 +58,7 @@ def of_restarts(runs: Sequence[Run]) -> Figure:
 
 
 def over_robots(runs: Sequence[Run]) -> Figure:
-    """Throughput, and the age of messages, over the number of robots whose programs run."""
+    """Throughput, and the age of messages, over the number of robots."""
     with style.figure(style.WIDTH_IN, 2.9) as figure:
         left, right = figure.subplots(1, 2)
         of_each = summaries(runs)
@@ -88,11 +88,11 @@ def over_robots(runs: Sequence[Run]) -> Figure:
 def _curve(
     axes: Axes, its: Sequence[Summary], measure: str, colour: str, dashes: object, name: str
 ) -> None:
-    told = [(summary.robots, summary.measures[measure]) for summary in its
+    points = [(summary.robots, summary.measures[measure]) for summary in its
             if measure in summary.measures]  # fmt: skip
     axes.errorbar(
-        [robots for robots, _ in told], [spread.mean for _, spread in told],
-        [spread.deviation or 0.0 for _, spread in told],
+        [robots for robots, _ in points], [spread.mean for _, spread in points],
+        [spread.deviation or 0.0 for _, spread in points],
         color=colour, ls=dashes, lw=1.2, marker="o", ms=2.5, capsize=1.5, label=name,
     )  # fmt: skip
 

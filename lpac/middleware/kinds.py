@@ -1,4 +1,4 @@
-"""Middleware of robots: one small interface, and an adapter for each."""
+"""The measured middlewares: one small interface, with an adapter for each."""
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
@@ -11,36 +11,36 @@ from typing import Protocol
 
 from lpac.extras import install_command
 
-# No middleware at all: what the others are compared with.
+# Reference without any middleware.
 NOTHING = "nothing"
 
 
 class Peer(Protocol):
-    """Sends to all other robots. It is closed when the robot's program ends."""
+    """Sends to all other robots, until the robot's program ends."""
 
     def publish(self, data: bytes) -> None:
-        """It may be lost, and nothing raises."""
+        """Send a message, which may be lost. Never raises."""
 
 
 class OpenPeer(Protocol):
-    """The function `open_peer` of an adapter's module."""
+    """Signature of `open_peer` in an adapter's module."""
 
     def __call__(
         self, index: int, endpoints: Sequence[str], receive: Callable[[bytes], None]
     ) -> AbstractContextManager[Peer]:
-        """Open robot `index`'s, of those at `endpoints`, each `<IPv4 address>:<port>`.
+        """Open robot `index`'s peer; `endpoints` are all robots', each `<IPv4 address>:<port>`.
 
-        `receive` is called with all that others say, from any thread, and only stores. Raises
-        OSError if a port is taken.
+        `receive` is called from any thread with each received message, and must only store it.
+        Raises OSError if a port is in use.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Middleware:
-    """`title` is for people, `adapter` the module, and `install` what a shell does to have it.
+    """`title` is for people, `adapter` the module, and `install` a shell command.
 
-    `version` tells which is installed; None: none is. One that `is_optional` is only measured where
-    it is installed.
+    `version` gives the installed version, or None. An optional middleware is only measured where it
+    is installed.
     """
 
     title: str
@@ -50,7 +50,7 @@ class Middleware:
     is_optional: bool = False
 
     def open_peer(self) -> OpenPeer:
-        """Raises ModuleNotFoundError if it is not installed."""
+        """Import the adapter. Raises ModuleNotFoundError if it is not installed."""
         opened: OpenPeer = importlib.import_module(self.adapter).open_peer
         return opened
 
@@ -63,8 +63,8 @@ def _of_package(name: str) -> str | None:
 
 
 def _of_fast_dds() -> str | None:
-    told: str | None = importlib.import_module("lpac.middleware.over_fastdds").version()
-    return told
+    installed: str | None = importlib.import_module("lpac.middleware.over_fastdds").version()
+    return installed
 
 
 _BENCH = install_command("bench")

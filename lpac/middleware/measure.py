@@ -1,6 +1,6 @@
-"""The runs: fleets of programs, a bulk stream between the first two places, and what is counted.
+"""Makes the runs: fleets of programs, a bulk stream between the first two places, and counts.
 
-Middlewares take turns, run by run, so that whatever drifts meanwhile drifts for all of them.
+Middlewares alternate run by run, so that slow drifts affect all of them equally.
 """
 
 import time
@@ -12,7 +12,7 @@ from threading import Lock
 from typing import NamedTuple, Self
 
 from lpac.middleware.kinds import NOTHING
-from lpac.middleware.places import NetworkPlace, News, Program
+from lpac.middleware.places import NetworkPlace, Notifier, Program
 from lpac.middleware.results import (
     CountedTime,
     Experiment,
@@ -24,22 +24,22 @@ from lpac.middleware.results import (
 )
 from lpac.sim.ports import free_ports
 
-# The ends of the stream; a fleet of one has a second place, too, where no program runs.
+# Ends of the stream. A fleet of one also has a second place, without a program.
 STREAM_PLACES = 2
-# How often all programs restart, and for how long then each message counts that arrives or not.
+# Period of restarts, and the time after each in which messages count.
 RESTART_EVERY_S, AFTER_S = 15.0, 10.0
-# Of a short run's only round the last part is no window: what is said there could not arrive.
+# In a short run, the last part of its only round does not count: messages could not arrive in time.
 _COUNTED_PART = 0.8
 _READY_WITHIN_S, _ACQUAINTED_WITHIN_S = 120.0, 20.0
-# TCP has found its rate, which a short run would count as slowness.
+# TCP settles at its rate first, which would lower the result of a short run.
 _STREAM_BEGINS_S = 1.0
-# What is on its way may arrive.
+# Messages in transit may still arrive.
 _ARRIVES_WITHIN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """One experiment's runs: each middleware with each number of robots, so often."""
+    """The runs of one experiment: each middleware and number of robots, `repetitions` times."""
 
     experiment: Experiment
     middlewares: tuple[str, ...]
@@ -49,11 +49,11 @@ class Plan:
 
     @property
     def places(self) -> int:
-        """How many it needs."""
+        """Number of places needed."""
         return max(STREAM_PLACES, *self.robots)
 
     def runs(self) -> Iterator[tuple[int, int, str]]:
-        """Repetition, robots, middleware, in the order in which they are made."""
+        """Repetition, robots and middleware of each run, in order."""
         for repetition in range(1, self.repetitions + 1):
             for robots in self.robots:
                 for middleware in self.middlewares:
@@ -67,21 +67,21 @@ class _Count(NamedTuple):
 
 @dataclass(slots=True)
 class _Robot:
-    """One place's, and what it has said since it was last asked."""
+    """The program at one place, and its messages since the last stop."""
 
     program: Program
     sent: list[Sent] = field(default_factory=list)
-    heard: list[Reception] = field(default_factory=list)
+    received: list[Reception] = field(default_factory=list)
 
 
 class MiddlewareFleet:
-    """A robot at each place. A context; its processes end with it.
+    """A robot at each place; a context manager that ends its processes.
 
-    What robots are told, and what they say, is in `lpac.middleware.robot`.
+    `lpac.middleware.robot` describes the lines exchanged with them.
     """
 
     def __init__(self, places: Sequence[NetworkPlace]) -> None:
-        self._news = News()
+        self._notifier = Notifier()
         self._lock = Lock()
         self._answers = 0
         self._robots: list[_Robot] = []
@@ -101,16 +101,19 @@ class MiddlewareFleet:
         self._stack.close()
 
     def load(self, middleware: str) -> None:
-        """Before anything is measured: what programs need is read from the disk. Raises OSError."""
+        """Load from disk before measuring. Raises OSError."""
         self._ask_all(len(self._robots), "load", middleware)
 
     def start(self, middleware: str, robots: int, start: int) -> None:
-        """Start, or restart, the programs of the first so many. Raises OSError."""
+        """Start or restart the programs of the first `robots` robots. Raises OSError."""
         for robot in self._robots[:robots]:
-            robot.program.tell("start", middleware, robots, start)
+            robot.program.send("start", middleware, robots, start)
 
     def meet(self, robots: int, start: int) -> bool:
-        """Wait until all of that start have heard each other: whether they have. Raises OSError."""
+        """Wait until all programs of that start have received from each other. Raises OSError.
+
+        Returns False after a timeout.
+        """
         pairs = robots * (robots - 1)
 
         def met() -> bool:
@@ -120,86 +123,90 @@ class MiddlewareFleet:
                     {
                         (message.robot, message.by)
                         for robot in self._robots
-                        for message in robot.heard
+                        for message in robot.received
                         if message.start == message.by_start == start
                     }
                 )
 
-        return self._news.wait(met, _ACQUAINTED_WITHIN_S)
+        return self._notifier.wait(met, _ACQUAINTED_WITHIN_S)
 
     def stop(self, robots: int) -> tuple[list[Sent], list[Reception]]:
-        """End their programs, and give all that was said. Raises OSError."""
+        """End the programs and return all messages. Raises OSError."""
         self._ask_all(robots, "stop")
         sent: list[Sent] = []
-        heard: list[Reception] = []
+        received: list[Reception] = []
         with self._lock:
             for robot in self._robots:
                 sent += robot.sent
-                heard += robot.heard
+                received += robot.received
                 robot.sent.clear()
-                robot.heard.clear()
-        return sent, heard
+                robot.received.clear()
+        return sent, received
 
     def check(self) -> None:
-        """Raises OSError if a program has failed."""
+        """Raise OSError if a program has failed."""
         for robot in self._robots:
             robot.program.check()
 
     def _program(self, index: int, place: NetworkPlace, endpoints: Sequence[str]) -> Program:
-        def hear(line: str) -> None:
+        def on_line(line: str) -> None:
             word, *numbers = line.split()
             values = [int(number) for number in numbers]
             with self._lock:
                 if word == "sent":
                     start, sequence, at_ns = values
                     robot.sent.append(Sent(index, start, sequence, 1e-9 * at_ns))
-                elif word == "heard":
+                elif word == "received":
                     by_start, other, start, sequence, sent_ns, at_ns = values
                     times_s = 1e-9 * sent_ns, 1e-9 * at_ns
-                    robot.heard.append(Reception(index, by_start, other, start, sequence, *times_s))
+                    robot.received.append(
+                        Reception(index, by_start, other, start, sequence, *times_s)
+                    )
                 else:
                     self._answers += 1
 
         command = ("lpac.middleware.robot", str(index), *endpoints)
-        robot = _Robot(Program(place, self._news, hear, *command))
+        robot = _Robot(Program(place, self._notifier, on_line, *command))
         self._robots.append(robot)
         return robot.program
 
     def _ask_all(self, robots: int, *words: object) -> None:
-        """Raises OSError if not all have answered within a long time."""
+        """Send a command and wait for the answers. Raises OSError after a timeout."""
         with self._lock:
             self._answers = 0
         for robot in self._robots[:robots]:
-            robot.program.tell(*words)
+            robot.program.send(*words)
 
         def answered() -> bool:
             self.check()
             return self._answers >= robots
 
-        if not self._news.wait(answered, _READY_WITHIN_S):
+        if not self._notifier.wait(answered, _READY_WITHIN_S):
             raise OSError(
-                f"{robots - self._answers} of {robots} robots' programs do not answer to "
-                f"{words[0]}: does this machine carry so many?"
+                f"no answer to {words[0]} from {robots - self._answers} of {robots} robots' "
+                "programs: this machine may be too slow for so many"
             )
 
 
 class Stream:
-    """As much as TCP carries from one place to another. A context; its processes end with it."""
+    """A TCP stream at full rate; a context manager that ends its processes."""
 
     def __init__(self, sender: NetworkPlace, receiver: NetworkPlace) -> None:
-        """Raises OSError if the one does not reach the other."""
-        self._news = News()
+        """Raises OSError if the sender does not reach the receiver."""
+        self._notifier = Notifier()
         self._port: int | None = None
         self._counts: list[_Count] = []
         with ExitStack() as stack:
             module = "lpac.middleware.stream"
             self._receiver = stack.enter_context(
-                Program(receiver, self._news, self._hear, module, "receive", receiver.address)
+                Program(
+                    receiver, self._notifier, self._on_line, module, "receive", receiver.address
+                )
             )
             self._wait(self._receiver, lambda: self._port is not None)
             address = receiver.address, str(self._port)
             self._sender = stack.enter_context(
-                Program(sender, self._news, self._hear, module, "send", *address)
+                Program(sender, self._notifier, self._on_line, module, "send", *address)
             )
             while not self.count().received:
                 time.sleep(0.05)
@@ -212,9 +219,9 @@ class Stream:
         self._stack.close()
 
     def count(self) -> _Count:
-        """All bytes so far. Raises OSError if the stream has broken."""
+        """Bytes received until now. Raises OSError if the stream has broken."""
         asked = len(self._counts) + 1
-        self._receiver.tell("count")
+        self._receiver.send("count")
         self._wait(self._receiver, lambda: len(self._counts) >= asked)
         self._sender.check()
         return self._counts[-1]
@@ -224,10 +231,10 @@ class Stream:
             program.check()
             return until()
 
-        if not self._news.wait(checked, _READY_WITHIN_S):
+        if not self._notifier.wait(checked, _READY_WITHIN_S):
             raise OSError("the bulk stream's program does not answer")
 
-    def _hear(self, line: str) -> None:
+    def _on_line(self, line: str) -> None:
         match line.split():
             case ["listening", port]:
                 self._port = int(port)
@@ -236,9 +243,9 @@ class Stream:
 
 
 def measure(
-    plan: Plan, places: Sequence[NetworkPlace], tell: Callable[[int, int, str], None]
+    plan: Plan, places: Sequence[NetworkPlace], report: Callable[[int, int, str], None]
 ) -> Generator[Run, None, None]:
-    """Each run as it is made; `tell` hears of each before. Who does not take all of them closes it.
+    """Yield each run; `report` is called before each. Close the generator to stop early.
 
     Raises OSError, one line, if a program fails.
     """
@@ -247,7 +254,7 @@ def measure(
             if middleware != NOTHING:
                 fleet.load(middleware)
         for repetition, robots, middleware in plan.runs():
-            tell(repetition, robots, middleware)
+            report(repetition, robots, middleware)
             yield _run(plan, fleet, places, repetition, robots, middleware)
 
 
@@ -282,11 +289,11 @@ def _run(
             fleet.check()
         last = stream.count()
         processor = used.share()
-    told: dict[str, float | None] = {}
+    fields: dict[str, float | None] = {}
     if speaks:
         time.sleep(_ARRIVES_WITHIN_S)
-        sent, heard = fleet.stop(robots)
-        told = of_traffic(traffic(sent, heard, windows, robots), restarted=restarted)
+        sent, received = fleet.stop(robots)
+        fields = of_traffic(traffic(sent, received, windows, robots), restarted=restarted)
     return Run(
         experiment=plan.experiment,
         middleware=middleware,
@@ -297,12 +304,12 @@ def _run(
         throughput_mbit_s=8e-6 * (last.received - first.received) / (last.at_s - first.at_s),
         processor=processor,
         met=met,
-        **told,
+        **fields,
     )
 
 
 def _rounds(plan: Plan) -> Iterator[tuple[int, float]]:
-    """The start of which programs are heard meanwhile, and how long, s."""
+    """Start number of the programs in each round, and its duration in s."""
     if plan.experiment == "robots":
         yield 0, plan.seconds
         return
@@ -312,7 +319,7 @@ def _rounds(plan: Plan) -> Iterator[tuple[int, float]]:
 
 
 class _ProcessorUse:
-    """The share of this machine's processors that is in use, from now on."""
+    """Share of this machine's processors that is in use, since construction."""
 
     def __init__(self) -> None:
         self._before = _jiffies()
@@ -323,7 +330,7 @@ class _ProcessorUse:
 
 
 def _jiffies() -> tuple[int, int]:
-    """Idle ones, and all."""
+    """Idle and total jiffies of all processors."""
     words = Path("/proc/stat").read_text().partition("\n")[0].split()
     counts = [int(word) for word in words[1:9]]
     return counts[3] + counts[4], sum(counts)

@@ -1,4 +1,4 @@
-"""Robots over Cyclone DDS, with the qualities of service that ROS 2 has by default."""
+"""Adapter of Cyclone DDS, with ROS 2's default quality of service."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -29,8 +29,8 @@ from edge.core.address import is_loopback
 from edge.messages.topics import MESSAGE, TOPICS
 from lpac.middleware.kinds import Peer
 
-# Below the ports that `lpac.sim.ports` gives; each process's are of a block of its own, and so the
-# fleets of two that measure at once on one loopback do not find each other.
+# Domain ports lie below those of `lpac.sim.ports`, in a block per process: fleets of two
+# measurements on one loopback do not discover each other.
 _DOMAINS, _PORTS_OF_A_BLOCK = 50, 200
 _QOS = Qos(
     Policy.Reliability.Reliable(duration(milliseconds=100)),
@@ -39,12 +39,12 @@ _QOS = Qos(
 )
 _MOST_AT_ONCE = 100
 _LOOK_UP_EVERY = duration(milliseconds=200)
-# On Wi-Fi it finds others by multicast and sends data to each, by itself; an interface of a network
-# namespace does not look like Wi-Fi to it.
+# On Wi-Fi, Cyclone DDS discovers by multicast and sends data to each peer, but it does not
+# recognise the interface of a network namespace as Wi-Fi.
 _WIFI = """<CycloneDDS><Domain><General>
 <Interfaces><NetworkInterface address="{address}"/></Interfaces>
 <AllowMulticast>spdp</AllowMulticast></General></Domain></CycloneDDS>"""
-# The loopback has no multicast: there it looks at ports, one after another.
+# The loopback has no multicast: peers are discovered by trying ports.
 _LOOPBACK = """<CycloneDDS><Domain><General>
 <Interfaces><NetworkInterface address="{address}"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General>
@@ -65,7 +65,7 @@ class _CyclonePeer:
         self._receive = receive
         self._domain = Domain(domain, config)
         self._participant = DomainParticipant(domain)
-        # As many as the product's robots declare, of which one is said here.
+        # All topics of a robot are declared, as on real robots; only MESSAGE is used.
         topics = {
             topic: Topic(self._participant, topic.name, Bytes)
             for topic in TOPICS
@@ -76,8 +76,8 @@ class _CyclonePeer:
         }
         self._reader = DataReader(self._participant, topics[MESSAGE], qos=_QOS)
         self._closed = Event()
-        # Not a listener: DDS calls it with its locks held, for which `write` waits while it holds
-        # Python's, so that now and then a program would stand still for ever.
+        # A thread instead of a listener: DDS calls listeners with its locks held. `write` would
+        # wait for these locks while it holds the GIL, a deadlock.
         self._receiving = Thread(target=self._take, daemon=True)
 
     def __enter__(self) -> Self:
@@ -87,7 +87,7 @@ class _CyclonePeer:
     def __exit__(self, *_: object) -> None:
         self._closed.set()
         self._receiving.join()
-        # What nothing refers to takes leave of the others; it has no call for that.
+        # Deleting the last reference announces the end to the others; there is no call for it.
         del self._reader
         self._writers.clear()
         del self._participant
@@ -106,7 +106,7 @@ class _CyclonePeer:
         while not self._closed.is_set():
             arrivals.wait(_LOOK_UP_EVERY)
             for sample in self._reader.take(_MOST_AT_ONCE):
-                # Else it is the news that a writer has gone.
+                # Otherwise a sample announces the end of a writer.
                 if isinstance(sample, Bytes):
                     self._receive(bytes(sample.data))
 
@@ -114,7 +114,7 @@ class _CyclonePeer:
 def open_peer(
     index: int, endpoints: Sequence[str], receive: Callable[[bytes], None]
 ) -> AbstractContextManager[Peer]:
-    """As `OpenPeer`. Robots find each other by themselves, on ports of DDS."""
+    """See `OpenPeer`. Robots discover each other on ports chosen by DDS."""
     address = endpoints[index].rpartition(":")[0]
     domain = int(endpoints[0].rpartition(":")[2]) // _PORTS_OF_A_BLOCK % _DOMAINS
     config = _LOOPBACK if is_loopback(address) else _WIFI

@@ -1,6 +1,6 @@
-"""Robots over Fast DDS, with the qualities of service that ROS 2 has by default.
+"""Adapter of Fast DDS, with ROS 2's default quality of service.
 
-It has no package for Python: `fast_dds.cpp` is compiled against the one that is installed, once.
+There is no Python package: `fast_dds.cpp` is compiled once against the installed library.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ from edge.messages.topics import MESSAGE, TOPICS
 from lpac.middleware.kinds import Peer
 
 _SOURCE = Path(__file__).with_name("fast_dds.cpp")
-# As Cyclone DDS's (`over_cyclone`): one measurement has them one after another.
+# As in `over_cyclone`: one measurement runs the two one after another.
 _DOMAINS, _PORTS_OF_A_BLOCK = 50, 200
 _LOOK_UP_EVERY_MS = 200
 _MOST_BYTES = 2**20
@@ -29,7 +29,7 @@ _TOPICS = (MESSAGE, *(t for t in TOPICS if t.sender == "robot" and t != MESSAGE)
 
 
 def version() -> str | None:
-    """None where Fast DDS, or a compiler, is missing."""
+    """Installed version; None without Fast DDS or a compiler."""
     library = _library()
     return None if library is None else library.fast_dds_version().decode()
 
@@ -42,7 +42,7 @@ def _library() -> ctypes.CDLL | None:
     name = hashlib.sha256(_SOURCE.read_bytes()).hexdigest()[:16]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lpac-edge"
     compiled = folder / f"fast-dds-{name}.so"
-    # Of another version of Fast DDS it cannot be loaded.
+    # Loading fails after Fast DDS was upgraded.
     with suppress(OSError):
         return _loaded(compiled)
     with suppress(OSError, subprocess.CalledProcessError):
@@ -59,7 +59,7 @@ def _library() -> ctypes.CDLL | None:
 
 
 def _loaded(path: Path) -> ctypes.CDLL:
-    """Raises OSError."""
+    """Load the library and declare its functions. Raises OSError."""
     library = ctypes.CDLL(str(path))
     pointer, number, text = ctypes.c_void_p, ctypes.c_uint32, ctypes.c_char_p
     for function, returns, takes in (
@@ -87,7 +87,7 @@ class _FastPeer:
         names = (ctypes.c_char_p * len(_TOPICS))(*(topic.name.encode() for topic in _TOPICS))
         self._peer = library.fast_dds_open(domain, address.encode(), names, len(_TOPICS))
         if self._peer is None:
-            raise OSError(f"Fast DDS does not open at {address}")
+            raise OSError(f"Fast DDS cannot open a participant at {address}")
         self._closed = Event()
         self._receiving = Thread(target=self._take, daemon=True)
 
@@ -102,7 +102,7 @@ class _FastPeer:
 
     def publish(self, data: bytes) -> None:
         if not self._library.fast_dds_publish(self._peer, data, len(data)):
-            sys.stderr.write("write: Fast DDS takes no more\n")
+            sys.stderr.write("write: the queue of Fast DDS is full\n")
 
     def _take(self) -> None:
         buffer = ctypes.create_string_buffer(_MOST_BYTES)
@@ -115,10 +115,10 @@ class _FastPeer:
 def open_peer(
     index: int, endpoints: Sequence[str], receive: Callable[[bytes], None]
 ) -> AbstractContextManager[Peer]:
-    """As `OpenPeer`. Robots find each other by themselves, on ports of DDS."""
+    """See `OpenPeer`. Robots discover each other on ports chosen by DDS."""
     library = _library()
     if library is None:
-        raise ModuleNotFoundError("Fast DDS is not installed here")
+        raise ModuleNotFoundError("Fast DDS is not installed")
     address = endpoints[index].rpartition(":")[0]
     domain = int(endpoints[0].rpartition(":")[2]) // _PORTS_OF_A_BLOCK % _DOMAINS
     return _FastPeer(library, domain, address, receive)

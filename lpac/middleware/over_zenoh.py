@@ -1,4 +1,4 @@
-"""Robots over zenoh: the product's own link, in a mesh, without keys."""
+"""Adapter of zenoh: the robots' own link, in a mesh, without keys."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -26,7 +26,7 @@ class _ZenohPeer:
 def open_peer(
     index: int, endpoints: Sequence[str], receive: Callable[[bytes], None]
 ) -> AbstractContextManager[Peer]:
-    """As `OpenPeer`. A robot connects to all before it, as fleet.toml's robots do."""
+    """See `OpenPeer`. Like the robots of fleet.toml, a robot connects to all before it."""
     return _ZenohPeer(
         ZenohLink(
             fleet="bench",

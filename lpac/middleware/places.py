@@ -1,4 +1,4 @@
-"""Where robots' programs run, and how they are started there."""
+"""Places of robots' programs in the network, and the processes there."""
 
 import contextlib
 import json
@@ -13,19 +13,19 @@ from typing import NamedTuple, Self
 
 from lpac.sim.programs import python_program
 
-# Longer than a robot's program waits for its own.
+# Longer than a robot's program waits for its child.
 _ENDS_WITHIN_S = 30.0
 _LOOK_AGAIN_S = 0.2
 
 
 class NetworkPlace(NamedTuple):
-    """A robot's place in the network; `namespace` None is this machine's own."""
+    """A robot's place in the network; `namespace` None is this machine's own network."""
 
     address: str
     namespace: str | None = None
 
     def enter(self, command: Sequence[str]) -> list[str]:
-        """The command line that runs a command there."""
+        """Command line that runs `command` there."""
         if self.namespace is None:
             return list(command)
         return ["ip", "netns", "exec", self.namespace, *command]
@@ -35,37 +35,37 @@ LOOPBACK = NetworkPlace("127.0.0.1")
 
 
 def place_in(namespace: str) -> NetworkPlace:
-    """At the namespace's first address. Raises ValueError, OSError."""
+    """The namespace's first address. Raises ValueError, OSError."""
     if os.geteuid() != 0:
-        raise ValueError("--namespaces: only root runs programs in network namespaces: use sudo")
+        raise ValueError("--namespaces: network namespaces need root: use sudo")
     if not Path("/run/netns", namespace).exists():
         raise ValueError(
-            f"--namespaces: no network namespace is called {namespace}: `ip netns` lists them"
+            f"--namespaces: there is no network namespace {namespace}: `ip netns` lists them"
         )
-    asked = ["ip", "-json", "-netns", namespace, "-4", "address", "show", "scope", "global"]
-    told = subprocess.run(asked, check=False, capture_output=True, text=True)
-    for interface in json.loads(told.stdout or "[]"):
+    command = ["ip", "-json", "-netns", namespace, "-4", "address", "show", "scope", "global"]
+    shown = subprocess.run(command, check=False, capture_output=True, text=True)
+    for interface in json.loads(shown.stdout or "[]"):
         for address in interface.get("addr_info", ()):
             return NetworkPlace(address["local"], namespace)
     raise ValueError(
-        f"--namespaces: {namespace} has no IPv4 address but its loopback's: `ip -n {namespace} "
+        f"--namespaces: {namespace} has no IPv4 address except on its loopback: `ip -n {namespace} "
         "address` shows all"
     )
 
 
-class News:
-    """Condition to wait on for lines of several programs."""
+class Notifier:
+    """Condition that is notified of lines and ends of several programs."""
 
     def __init__(self) -> None:
         self._changed = Condition()
 
-    def tell(self) -> None:
-        """Something was said, or a program has ended."""
+    def notify(self) -> None:
+        """Wake up `wait`."""
         with self._changed:
             self._changed.notify_all()
 
     def wait(self, until: Callable[[], bool], at_most_s: float) -> bool:
-        """Whether it came true within that time."""
+        """Wait for a condition; returns False after the timeout."""
         ends_s = time.monotonic() + at_most_s
         with self._changed:
             while not until():
@@ -77,18 +77,18 @@ class News:
 
 
 class Program:
-    """A module of this package that runs as a process at a place. A context, which ends it.
+    """A module of this package as a process at a place; a context manager that ends it.
 
-    It ends with this process, too, however that ends: its standard input does.
+    The process also ends with this one, in any case, since its standard input closes.
     """
 
     def __init__(
-        self, place: NetworkPlace, news: News, hear: Callable[[str], None], *command: str
+        self, place: NetworkPlace, notifier: Notifier, on_line: Callable[[str], None], *command: str
     ) -> None:
-        """`command` is the module and its arguments; `hear` gets its lines, from a thread."""
+        """`command` is a module and its arguments; `on_line` gets its output, from a thread."""
         self._command = command
-        self._news = news
-        self._hear = hear
+        self._notifier = notifier
+        self._on_line = on_line
         self._problem: str | None = None
         self._leaving = False
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the program runs
@@ -99,7 +99,7 @@ class Program:
             stderr=self._errors,
             text=True,
             bufsize=1,
-            # Ctrl-C is this process's own matter.
+            # Ctrl-C is handled by this process alone.
             start_new_session=True,
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         )
@@ -122,14 +122,14 @@ class Program:
         self._errors.close()
 
     def leave(self) -> None:
-        """Tell it to end; who has several tells all of them before waiting for each."""
+        """Ask the process to end. With several programs, ask all before waiting for one."""
         self._leaving = True
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
 
-    def tell(self, *words: object) -> None:
-        """One line. Raises OSError if it has ended."""
+    def send(self, *words: object) -> None:
+        """Write one line. Raises OSError if the process has ended."""
         self.check()
         assert self._process.stdin is not None
         try:
@@ -140,7 +140,7 @@ class Program:
             raise
 
     def check(self) -> None:
-        """Raises OSError if it has failed or ended; the text says why."""
+        """Raise OSError with the cause if the process has failed or ended."""
         if self._problem is not None:
             raise OSError(f"{self._command[0]}: {self._problem}")
 
@@ -151,10 +151,10 @@ class Program:
             if word == "failed":
                 self._problem = self._problem or rest
             else:
-                self._hear(line)
-            self._news.tell()
+                self._on_line(line)
+            self._notifier.notify()
         if not self._leaving and self._problem is None:
             self._errors.seek(0)
             last = self._errors.read().decode(errors="replace").strip().splitlines()[-1:]
-            self._problem = " ".join(["it ended", *last])
-        self._news.tell()
+            self._problem = " ".join(["the program ended", *last])
+        self._notifier.notify()

@@ -1,4 +1,4 @@
-"""Results of runs: messages sent and heard, and summaries of runs of one kind. Pure."""
+"""Results of runs: messages sent and received, and summaries of equal runs. Pure functions."""
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,7 +12,7 @@ EXPERIMENTS: tuple[Experiment, ...] = ("restarts", "robots")
 
 
 class Sent(NamedTuple):
-    """One message of a robot's `start`th program."""
+    """A message of a robot's program number `start`."""
 
     robot: int
     start: int
@@ -21,7 +21,7 @@ class Sent(NamedTuple):
 
 
 class Reception(NamedTuple):
-    """That message as another robot's `by_start`th program heard it."""
+    """Its reception by program number `by_start` of robot `by`."""
 
     by: int
     by_start: int
@@ -33,7 +33,7 @@ class Reception(NamedTuple):
 
 
 class CountedTime(NamedTuple):
-    """Messages that programs of that start, the fleet's, sent within a time."""
+    """A time in which messages of programs with number `start` count."""
 
     start: int
     from_s: float
@@ -42,11 +42,11 @@ class CountedTime(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """Fate of messages.
+    """Deliveries of the messages that count.
 
-    `delivered` is the share that arrived, of one for each other robot; `ages_s` how old each was
-    when it did. `heard_s` has for each window and pair of robots how long after the window began
-    the one first heard the other, None if it never did.
+    `delivered` is the share that arrived, where each message counts once per other robot. `ages_s`
+    are ages on arrival. `heard_s` has, for each window and pair of robots, the time from the
+    window's begin to the first reception, None if there was none.
     """
 
     delivered: float | None
@@ -55,9 +55,9 @@ class Delivery:
 
 
 def traffic(
-    sent: Iterable[Sent], heard: Iterable[Reception], windows: Sequence[CountedTime], robots: int
+    sent: Iterable[Sent], received: Iterable[Reception], windows: Sequence[CountedTime], robots: int
 ) -> Delivery:
-    """Of programs that were started together, and of those alone."""
+    """Evaluate the messages between programs of the same start."""
     by_start = {window.start: window for window in windows}
 
     def counts(start: int, at_s: float) -> bool:
@@ -67,7 +67,7 @@ def traffic(
     expected = (robots - 1) * sum(counts(message.start, message.at_s) for message in sent)
     first: dict[tuple[int, int, int], float] = {}
     ages_s = []
-    for message in heard:
+    for message in received:
         if message.by_start != message.start or message.start not in by_start:
             continue
         pair = (message.start, message.robot, message.by)
@@ -87,15 +87,14 @@ def traffic(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """One measurement: so many robots, and so many s of the bulk stream.
+    """One measurement.
 
-    `middleware` is "nothing" where robots have no programs; what tells of messages is None then.
-    `began` is in s since 1970. `delivered` is a share, after restarts if the run has some, and
-    `age_…_ms` are of what was delivered. `heard_again_…_s` are over all pairs of robots and all
-    restarts; `never_heard` is the share of the pairs that had not heard each other when the next
-    restart came. `processor` is the share of this machine's processors that was in use. `met` tells
-    whether all robots had heard each other before the run began: what they say to those that they
-    have not met counts as lost.
+    `middleware` is "nothing" for robots without programs; fields about messages are None then.
+    `began` is Unix time in s. `delivered` is a share; in runs with restarts, of the messages after
+    a restart. `age_…_ms` are ages of delivered messages. `heard_again_…_s` are over all pairs of
+    robots and all restarts; `never_heard` is the share of pairs without a reception before the next
+    restart. `processor` is the used share of this machine's processors. `met` is whether all robots
+    had received from each other before the run; if not, messages between those pairs count as lost.
     """
 
     experiment: Experiment
@@ -121,15 +120,15 @@ MEASURES = (
 )  # fmt: skip
 
 
-def of_traffic(told: Delivery, *, restarted: bool) -> dict[str, float | None]:
-    """The fields of a `Run` that tell of messages."""
-    fields: dict[str, float | None] = {"delivered": told.delivered}
-    if told.ages_s:
-        p50_s, p99_s = np.quantile(told.ages_s, (0.5, 0.99)).tolist()
+def of_traffic(delivery: Delivery, *, restarted: bool) -> dict[str, float | None]:
+    """Fields of a `Run` about messages."""
+    fields: dict[str, float | None] = {"delivered": delivery.delivered}
+    if delivery.ages_s:
+        p50_s, p99_s = np.quantile(delivery.ages_s, (0.5, 0.99)).tolist()
         fields |= {"age_p50_ms": 1e3 * p50_s, "age_p99_ms": 1e3 * p99_s}
-    if restarted and told.heard_s:
-        times_s = [time_s for time_s in told.heard_s if time_s is not None]
-        fields["never_heard"] = 1.0 - len(times_s) / len(told.heard_s)
+    if restarted and delivery.heard_s:
+        times_s = [time_s for time_s in delivery.heard_s if time_s is not None]
+        fields["never_heard"] = 1.0 - len(times_s) / len(delivery.heard_s)
         if times_s:
             fields["heard_again_p50_s"] = statistics.median(times_s)
             fields["heard_again_max_s"] = max(times_s)
@@ -137,7 +136,7 @@ def of_traffic(told: Delivery, *, restarted: bool) -> dict[str, float | None]:
 
 
 class Spread(NamedTuple):
-    """Of several runs: the mean, and the standard deviation, None of a single one."""
+    """Mean and standard deviation of several runs; the deviation of a single run is None."""
 
     mean: float
     deviation: float | None
@@ -146,7 +145,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Runs with one middleware and so many robots; a measure that no run has is not in it."""
+    """Runs with one middleware and number of robots; measures without values are left out."""
 
     experiment: Experiment
     middleware: str
@@ -155,10 +154,10 @@ class Summary:
 
 
 def summaries(runs: Sequence[Run]) -> list[Summary]:
-    """Of those in which robots had met, in the order of their first runs."""
+    """Summaries of the runs with `met`, in the order of their first runs."""
     counted = [run for run in runs if run.met]
     kinds = dict.fromkeys((run.experiment, run.middleware, run.robots) for run in counted)
-    told = []
+    found = []
     for kind in kinds:
         its = [run for run in counted if (run.experiment, run.middleware, run.robots) == kind]
         measures = {}
@@ -167,22 +166,22 @@ def summaries(runs: Sequence[Run]) -> list[Summary]:
             if values:
                 deviation = statistics.stdev(values) if len(values) > 1 else None
                 measures[measure] = Spread(statistics.mean(values), deviation, len(values))
-        told.append(Summary(*kind, measures))
-    return told
+        found.append(Summary(*kind, measures))
+    return found
 
 
 def left_out(runs: Sequence[Run]) -> str:
-    """How many runs the summaries leave out, and why; "" if none."""
+    """Number of runs left out of the summaries, and why; "" if there are none."""
     unmet = sum(not run.met for run in runs)
     if not unmet:
         return ""
     return (
-        f"left out: {unmet} of {len(runs)} runs, before which robots had not all heard each other"
+        f"left out: {unmet} of {len(runs)} runs that began before all robots had heard each other"
     )
 
 
 def as_json(measured_on: Mapping[str, Any], runs: Sequence[Run]) -> dict[str, Any]:
-    """All of it, for other programs."""
+    """All results, for scripts."""
     return {
         "measured_on": dict(measured_on),
         "summaries": [

@@ -1,19 +1,18 @@
-"""`python -m lpac.middleware.robot INDEX ENDPOINT...`: a robot's program, as far as the radio goes.
+"""`python -m lpac.middleware.robot INDEX ENDPOINT...`: the radio traffic of a robot's program.
 
-It says a message as large, and as often, as a robot does, and tells what it hears. Each start is a
-process of its own, forked from this one, so that it has its middleware at once: seconds of imports
-would take the processors from what is measured. The commands are lines on its standard input,
-whose end ends it:
+Sends messages of a robot's size and rate, and reports received ones. Each start is a process forked
+from this one with the middleware already loaded: imports would load the processors for seconds.
+Commands are lines on standard input; its end ends the process:
 
-- `load MIDDLEWARE`: what the forks will need; answered with `loaded`;
-- `start MIDDLEWARE ROBOTS START`: the `START`th program, in a fleet of so many. One that runs is
-  told to leave first, as systemd does it;
+- `load MIDDLEWARE`: import it before forking; answered with `loaded`;
+- `start MIDDLEWARE ROBOTS START`: run program number `START` in a fleet of `ROBOTS`. A running one
+  is terminated first, as by systemd;
 - `stop`: answered with `stopped`.
 
-It says, times in ns of this machine's monotonic clock:
+Output lines, times in ns of this machine's monotonic clock:
 
-- `sent START SEQUENCE AT` and `heard START FROM FROM_START SEQUENCE SENT AT`;
-- `failed TEXT`: its program has ended by itself, or does not leave.
+- `sent START SEQUENCE AT` and `received START FROM FROM_START SEQUENCE SENT AT`;
+- `failed TEXT`: a program ended unexpectedly, or does not terminate.
 """
 
 import os
@@ -30,19 +29,19 @@ from lpac.middleware.kinds import MIDDLEWARES
 from lpac.radio.airtime import MESSAGE_BYTES
 
 SIZE_BYTES = round(MESSAGE_BYTES["float16"])
-# Robot, start, sequence, when it was sent.
+# Robot, start, sequence, time sent.
 _HEAD = struct.Struct("<HHIq")
 _LEAVES_WITHIN_S = 10.0
 _LOOK_AGAIN_S = 0.01
 
 
-def _say(*words: object) -> None:
-    """One line, whole, from whatever thread and process."""
+def _write_line(*words: object) -> None:
+    """Write one whole line, from any thread and process."""
     os.write(sys.stdout.fileno(), " ".join(map(str, words)).encode() + b"\n")
 
 
 class _Program:
-    """The process that is the robot's program now."""
+    """The process that is the robot's present program."""
 
     def __init__(self, index: int, endpoints: Sequence[str]) -> None:
         self._index = index
@@ -59,9 +58,9 @@ class _Program:
                 self._run(middleware, robots, start, parent)
                 status = 0
             except BaseException as error:
-                _say("failed", *str(error).split())
+                _write_line("failed", *str(error).split())
             finally:
-                # A middleware's threads may hold an interpreter that ends in the ordinary way.
+                # Threads of a middleware can block a normal exit of the interpreter.
                 os._exit(status)
 
     def stop(self) -> None:
@@ -74,12 +73,12 @@ class _Program:
             if time.monotonic() > patience_until_s:
                 os.kill(pid, signal.SIGKILL)
                 os.waitpid(pid, 0)
-                _say("failed", "its program stands still, and does not leave")
+                _write_line("failed", "its program hangs and does not terminate")
                 return
             time.sleep(_LOOK_AGAIN_S)
-        # Of a signal that came before it listened to any, it leaves too.
+        # Before the handler is installed, SIGTERM itself ends the process.
         if ended[1] not in (0, signal.SIGTERM):
-            _say("failed", "its program has ended by itself, with", ended[1])
+            _write_line("failed", "its program ended unexpectedly, with status", ended[1])
 
     def _run(self, middleware: str, robots: int, start: int, parent: int) -> None:
         stopped = Stop()
@@ -89,37 +88,37 @@ class _Program:
             at_ns = time.monotonic_ns()
             robot, its_start, sequence, sent_ns = _HEAD.unpack_from(data)
             if robot != self._index:
-                _say("heard", start, robot, its_start, sequence, sent_ns, at_ns)
+                _write_line("received", start, robot, its_start, sequence, sent_ns, at_ns)
 
         open_peer = MIDDLEWARES[middleware].open_peer()
         period_s = 1.0 / MESSAGE.rate_hz
         with open_peer(self._index, self._endpoints[:robots], receive) as peer:
-            # Robots do not keep step.
+            # Robots are not synchronised.
             due_s = time.monotonic() + random.SystemRandom().uniform(0.0, period_s)
             sequence = 0
             while not stopped.wait(max(0.0, due_s - time.monotonic())) and os.getppid() == parent:
                 sent_ns = time.monotonic_ns()
                 head = _HEAD.pack(self._index, start, sequence, sent_ns)
                 peer.publish(head.ljust(SIZE_BYTES, b"\0"))
-                _say("sent", start, sequence, sent_ns)
+                _write_line("sent", start, sequence, sent_ns)
                 sequence += 1
                 due_s += period_s
 
 
 def main() -> None:
-    """Obey the lines of the standard input."""
+    """Execute the commands on standard input."""
     index, endpoints = int(sys.argv[1]), sys.argv[2:]
     program = _Program(index, endpoints)
     for line in sys.stdin:
         match line.split():
             case ["load", middleware]:
                 MIDDLEWARES[middleware].open_peer()
-                _say("loaded")
+                _write_line("loaded")
             case ["start", middleware, robots, start]:
                 program.start(middleware, int(robots), int(start))
             case ["stop"]:
                 program.stop()
-                _say("stopped")
+                _write_line("stopped")
     program.stop()
 
 

@@ -1,7 +1,7 @@
-"""`python -m lpac.middleware.stream receive ADDRESS`, or `send ADDRESS PORT`: what TCP carries.
+"""`python -m lpac.middleware.stream receive ADDRESS`, or `send ADDRESS PORT`: a TCP bulk stream.
 
-The receiver says `listening PORT`. It answers each line on its standard input with
-`received BYTES AT`: all so far, and the time in ns of this machine's monotonic clock. Both end with
+The receiver prints `listening PORT`. It answers each line on standard input with
+`received BYTES AT`: the total, and the time in ns of this machine's monotonic clock. Both end with
 their standard input.
 """
 
@@ -16,21 +16,21 @@ _BLOCK = 2**17
 _CONNECT_WITHIN_S = 20.0
 
 
-def _say(*words: object) -> None:
+def _write_line(*words: object) -> None:
     os.write(sys.stdout.fileno(), " ".join(map(str, words)).encode() + b"\n")
 
 
-def _was_told() -> bool:
-    """Whether there was a line; False if there will be none any more."""
+def _read_input() -> bool:
+    """Consume input; False at its end."""
     return bool(os.read(sys.stdin.fileno(), 1024))
 
 
 def receive(address: str) -> None:
-    """Of one sender, as soon as it comes."""
+    """Receive from the first sender that connects."""
     asks, buffer, count = sys.stdin.fileno(), bytearray(_BLOCK), 0
     with ExitStack() as stack:
         server = stack.enter_context(socket.create_server((address, 0)))
-        _say("listening", server.getsockname()[1])
+        _write_line("listening", server.getsockname()[1])
         stream: socket.socket | None = None
         listened: list[socket.socket | int] = [asks, server]
         while True:
@@ -45,13 +45,13 @@ def receive(address: str) -> None:
                 if not got:
                     listened = [asks]
             if asks in readable:
-                if not _was_told():
+                if not _read_input():
                     return
-                _say("received", count, time.monotonic_ns())
+                _write_line("received", count, time.monotonic_ns())
 
 
 def send(address: str, port: int) -> None:
-    """Until it is told to end, or nobody receives any more."""
+    """Send until standard input or the receiver closes."""
     asks, block = sys.stdin.fileno(), bytes(_BLOCK)
     with socket.create_connection((address, port), timeout=_CONNECT_WITHIN_S) as stream:
         stream.setblocking(False)
@@ -64,7 +64,7 @@ def send(address: str, port: int) -> None:
 
 
 def main() -> None:
-    """A failure is one line, `failed TEXT`."""
+    """Run; a failure is one line, `failed TEXT`."""
     try:
         match sys.argv[1:]:
             case ["receive", address]:
@@ -72,7 +72,7 @@ def main() -> None:
             case ["send", address, port]:
                 send(address, int(port))
     except OSError as error:
-        _say("failed", *str(error).split())
+        _write_line("failed", *str(error).split())
 
 
 if __name__ == "__main__":

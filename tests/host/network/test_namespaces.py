@@ -59,4 +59,4 @@ def test_each_robot_is_in_its_namespace(namespaces: tuple[str, ...], tmp_path: P
 def test_a_namespace_that_is_not_there_is_named(namespaces: tuple[str, ...]) -> None:
     names = f"{namespaces[0]},no-such-place"
     asked = ("bench", "network", "robots", "-n", 2, "--middleware", "zenoh", "--namespaces", names)
-    assert "no network namespace is called no-such-place" in error_line(lpac(*asked))
+    assert "there is no network namespace no-such-place" in error_line(lpac(*asked))

@@ -1,4 +1,4 @@
-"""`lpac bench network` as a user types it, on the loopback: real programs, sockets and clocks."""
+"""`lpac bench network` on the loopback: real programs, sockets and clocks."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from lpac.middleware.results import MEASURES
 from tests.command import called, error_line, lpac
 from tests.conftest import ROOT
 
-# What nothing waits for within that time will not come, however busy the machine is.
+# Timeout, also for a busy machine.
 PATIENCE_S = 120.0
 INSTALLED = [
     pytest.param(
@@ -49,7 +49,7 @@ def test_robots_hear_each_other_and_do_so_again_after_all_have_restarted(middlew
             (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1),
         }  # fmt: skip
         assert all(message.at_s >= message.sent_s for message in heard)
-        # And each only once.
+        # Each only once.
         assert len(set(heard)) == len(heard)
 
 
@@ -62,12 +62,12 @@ def test_a_program_that_has_ended_by_itself_is_no_result() -> None:
         first = min(_robots_of(os.getpid()))
         [program] = _robots_of(first)
         os.kill(program, signal.SIGKILL)
-        with pytest.raises(OSError, match="robot: its program has ended by itself, with 9"):
+        with pytest.raises(OSError, match="robot: its program ended unexpectedly, with status 9"):
             fleet.stop(2)
 
 
 def _robots_of(parent: int) -> list[int]:
-    """The processes that it has started."""
+    """Child processes of `parent`."""
     told = [path.read_text() for path in Path(f"/proc/{parent}/task").glob("*/children")]
     children = [int(child) for children in told for child in children.split()]
     return [
@@ -170,7 +170,7 @@ def test_however_it_ends_its_programs_end(number: signal.Signals, tmp_path: Path
         stderr=subprocess.PIPE, process_group=0, text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT), name: value},
     ) as ended:  # fmt: skip
-        # In the middle of a run: something is measured already.
+        # During a run, after some results.
         while not (tmp_path / "network.json").exists():
             assert ended.poll() is None
             time.sleep(0.02)
@@ -187,7 +187,7 @@ def test_however_it_ends_its_programs_end(number: signal.Signals, tmp_path: Path
 
 
 def _processes(mark: str) -> Iterator[int]:
-    """Of this environment."""
+    """Processes whose environment has the mark."""
     for path in Path("/proc").glob("[0-9]*/environ"):
         try:
             if mark.encode() in path.read_bytes().split(b"\0"):

@@ -1,4 +1,4 @@
-"""What runs came to."""
+"""Evaluation of runs."""
 
 from importlib.metadata import PackageNotFoundError
 from itertools import count
@@ -31,7 +31,7 @@ def test_what_was_said_in_the_window_counts_and_once_for_each_other_robot() -> N
     sent = [Sent(robot, 1, sequence, 10.0 + sequence) for robot in range(3) for sequence in (0, 4)]
     heard = [
         Reception(by=1, by_start=1, robot=0, start=1, sequence=0, sent_s=10.0, at_s=10.2),
-        # Said in the window, and heard when it was over.
+        # Sent in the window, received after it.
         Reception(by=2, by_start=1, robot=0, start=1, sequence=0, sent_s=10.0, at_s=13.0),
         Reception(by=1, by_start=1, robot=0, start=1, sequence=4, sent_s=14.0, at_s=14.1),
     ]
@@ -64,7 +64,7 @@ def test_each_restart_has_a_window_of_its_own() -> None:
     fields = of_traffic(told, restarted=True)
     assert fields["heard_again_p50_s"] == pytest.approx(0.75)
     assert fields["heard_again_max_s"] == pytest.approx(1.0)
-    # The other one said nothing.
+    # The other robot sent nothing.
     assert fields["never_heard"] == 0.5
 
 
@@ -104,7 +104,7 @@ def test_runs_whose_robots_had_not_met_are_left_out_and_counted() -> None:
     met = [_run("zenoh", 70.0), _run(NOTHING, 80.0)]
     runs = [*met, _run("zenoh", 20.0, met=False), _run("cyclonedds", 30.0, met=False)]
     assert summaries(runs) == summaries(met)
-    told = "left out: 2 of 4 runs, before which robots had not all heard each other"
+    told = "left out: 2 of 4 runs that began before all robots had heard each other"
     assert (left_out(met), left_out(runs)) == ("", told)
     assert [run["met"] for run in as_json({}, runs)["runs"]] == [True, True, False, False]
     figure = of_restarts(runs)
@@ -121,7 +121,7 @@ def test_middlewares_take_turns() -> None:
     assert list(plan.runs())[:5] == [
         (1, 1, "zenoh"), (1, 1, NOTHING), (1, 2, "zenoh"), (1, 2, NOTHING), (2, 1, "zenoh"),
     ]  # fmt: skip
-    # Who is alone has a stream, too.
+    # A single robot has a stream, too.
     assert plan.places == 2
 
 
