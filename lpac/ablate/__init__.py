@@ -1,1 +1,1 @@
-"""What each part of a method is worth: policies that are trained, or fly, without it."""
+"""Ablations: policies trained, or flown, without a part of the method."""

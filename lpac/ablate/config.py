@@ -1,8 +1,8 @@
-"""What `lpac ablate` is told: a TOML file, as frozen dataclasses; and the trainings that it means.
+"""Configuration of `lpac ablate`, TOML as frozen dataclasses, and its trainings.
 
-Compute is equal: every variant has as many flights, states, epochs, rounds and candidates as the
-base. What goes without DAgger has them too: with `dagger.expert_flights` of 1 the expert flies in
-the rounds instead of the policy.
+Compute is equal: each variant has as many flights, states, epochs, rounds and candidates as the
+base. A variant without DAgger keeps the rounds, but the expert flies in them:
+`dagger.expert_flights` = 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ from lpac.study.study import BASELINES, Condition
 from lpac.train.config import ReadConfig, TrainingConfig, config_of, require_name
 
 BASE = "base"
-# Keys of a training that no variant changes: how much is computed, and what the task is.
-_EQUAL = (
+# Keys of a training that variants must not change: amount of compute, and task.
+_FIXED_KEYS = (
     "data.flights", "data.states", "data.duration_s", "fit.epochs", "dagger.rounds",
     "dagger.flights", "dagger.duration_s", "dagger.epochs", "select.worlds", "select.set_ups",
     "select.duration_s", "select.every_epochs", "perception.sensor_size",
@@ -31,10 +31,10 @@ _EQUAL = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """What is otherwise than in the base: `why` is a sentence that says it to people.
+    """A variant's difference from the base. `why` is a sentence for the report.
 
-    `train` is merged into the base's configuration, `fly` into how that is flown. One that only
-    flies otherwise has the base's policies.
+    `train` is merged into the base's configuration, `fly` into its condition. A variant without
+    `train` flies the base's policies.
     """
 
     name: str
@@ -45,19 +45,20 @@ class Variant:
     def __post_init__(self) -> None:
         require_name(self.name)
         if self.name in (BASE, *BASELINES):
-            raise ValueError(f"name = {self.name!r}: is what the variants are held against")
+            raise ValueError(f"name = {self.name!r}: is reserved for the base and the baselines")
         if not self.why.strip() or "\n" in self.why.strip():
-            raise ValueError(f"why = {self.why!r}: must be a sentence, on one line")
+            raise ValueError(f"why = {self.why!r}: must be a sentence on one line")
         if not self.train and not self.fly:
-            raise ValueError("train, fly: one of them must say what is otherwise")
+            raise ValueError("train and fly are empty: set a key of at least one")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AblationConfig:
-    """The file. `base` is the path of a training's configuration, from the file's folder.
+    """The file. `base` is the path of a training's configuration, relative to the file.
 
-    `train` is merged into that, and `fly` has keys of a study's condition, for the base and all
-    variants. All are trained with each of `seeds`, and judged over `worlds` worlds in `set_up`.
+    `train` is merged into that configuration. `fly` has keys of a study's condition, for the base
+    and all variants. Each is trained with each of `seeds`, and flown over `worlds` worlds in
+    `set_up`.
     """
 
     base: str
@@ -74,7 +75,7 @@ class AblationConfig:
         names = [variant.name for variant in self.variants]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"variants: name = {name!r}: must be one variant's alone")
+                raise ValueError(f"variants: name = {name!r}: is used twice")
         if not self.variants:
             raise ValueError("variants = []: must be one or more")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
@@ -89,7 +90,7 @@ class AblationConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedTraining:
-    """A training of the base or of a variant; `name` is that of its folder and of its policy."""
+    """A training of the base or a variant; `name` is that of its folder and of its policy."""
 
     name: str
     seed: int
@@ -98,7 +99,7 @@ class PlannedTraining:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedVariant:
-    """The base or a variant; `trained` is False of one that flies the base's trainings."""
+    """The base or a variant; `trained` is False for variants that fly the base's policies."""
 
     name: str
     why: str
@@ -109,26 +110,26 @@ class PlannedVariant:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ablation:
-    """What the file means; the base is the first of `variants`."""
+    """An ablation; the base is the first of `variants`."""
 
     config: AblationConfig
     variants: tuple[PlannedVariant, ...]
 
     @property
     def trainings(self) -> list[PlannedTraining]:
-        """Each once."""
+        """All trainings, each once."""
         return [each for variant in self.variants if variant.trained for each in variant.trainings]
 
     @property
     def worlds(self) -> range:
-        """Numbers of those that are flown over: none that weights are chosen by."""
+        """Numbers of the worlds, without those used to select weights."""
         select = self.variants[0].trainings[0].read.config.select
         first = select.worlds if self.config.world_set == "validation" else 0
         return range(first, first + self.config.worlds)
 
 
 def read_ablation(path: Path) -> Ablation:
-    """Raises ConfigError that names the file, the line or key, the value and what is allowed."""
+    """Read a file. Raises ConfigError that names the file, the line or key, and what is allowed."""
     config = from_mapping(AblationConfig, read_toml(path), str(path))
     _require_no_names(config.train, str(path))
     base_path = path.parent / config.base
@@ -159,7 +160,7 @@ def read_ablation(path: Path) -> Ablation:
 def _condition(
     config: AblationConfig, name: str, fly: Mapping[str, object], where: str, folder: Path
 ) -> Condition:
-    """Under which a variant flies."""
+    """Condition under which a variant flies."""
     keys = {"set_up": config.set_up, "duration_s": config.duration_s, "title": name}
     return condition_of({**keys, **merged(config.fly, fly)}, f"{where}: fly", folder)
 
@@ -178,15 +179,15 @@ def _trainings(
 def _require_no_names(train: Mapping[str, object], where: str) -> None:
     for key in ("seed", "export"):
         if key in train:
-            raise ConfigError(f"{where}: train.{key}: is not to be set: it follows from `seeds`")
+            raise ConfigError(f"{where}: train.{key}: must not be set: it follows from `seeds`")
 
 
 def _require_equal_compute(config: TrainingConfig, base: TrainingConfig, where: str) -> None:
-    for key in _EQUAL:
+    for key in _FIXED_KEYS:
         value, allowed = attrgetter(key)(config), attrgetter(key)(base)
         if value != allowed:
-            hint = "; without DAgger is dagger.expert_flights = 1" if "dagger" in key else ""
+            hint = "; dagger.expert_flights = 1 switches DAgger off" if "dagger" in key else ""
             raise ConfigError(
-                f"{where}: train.{key} = {value}: must be the base's, {allowed}, or what is "
-                f"compared would not be as much work{hint}"
+                f"{where}: train.{key} = {value}: must be the base's, {allowed}, for equal "
+                f"compute{hint}"
             )

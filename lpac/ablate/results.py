@@ -1,4 +1,4 @@
-"""Results of the variants of an ablation, and whether they differ from the base."""
+"""Results of an ablation's variants, and their comparison with the base."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,9 +14,9 @@ from lpac.study.study import Condition, Method, Study, TrainedBundle
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VariantResult:
-    """Of S trainings over K worlds: `final` (S, K) are costs at the end over those at the start.
+    """S trainings over K worlds: `final` (S, K) is the final cost over the initial cost.
 
-    `against_base` is None for the base itself; its A is the variant, its B the base.
+    `against_base` compares the variant (A) with the base (B); None for the base.
     """
 
     variant: PlannedVariant
@@ -26,18 +26,18 @@ class VariantResult:
 
     @property
     def mean(self) -> Interval95:
-        """Over trainings and worlds."""
+        """Mean over trainings and worlds."""
         return bootstrap(self.final)
 
     @property
     def deviation(self) -> float | None:
-        """The standard deviation of the trainings' means; None of a single one."""
+        """Standard deviation of the trainings' means; None for a single training."""
         means = self.final.mean(axis=1)
         return float(means.std(ddof=1)) if len(means) > 1 else None
 
     @property
     def verdict(self) -> Literal["better", "worse", "not distinguishable"] | None:
-        """Of the variant, against the base."""
+        """The variant relative to the base; None for the base."""
         if self.against_base is None:
             return None
         better = self.against_base.better
@@ -45,7 +45,7 @@ class VariantResult:
 
 
 def study_of(ablation: Ablation, bundles: Mapping[str, TrainedBundle]) -> Study:
-    """The flights by which variants are judged: a condition, and often a policy, for each of them.
+    """The ablation's flights: one condition per variant, and one method per trained variant.
 
     `bundles` are by the trainings' names.
     """
@@ -68,9 +68,9 @@ def study_of(ablation: Ablation, bundles: Mapping[str, TrainedBundle]) -> Study:
 def results_of(
     ablation: Ablation, flown: Mapping[Condition, Sequence[MethodResult]]
 ) -> list[VariantResult]:
-    """Each variant's, the base's first; `flown` is what its study came to.
+    """Results of all variants, the base first; `flown` are those of `study_of`.
 
-    Trainings of a variant and of the base are independent of each other, unless they are the same.
+    Trainings of a variant and of the base are independent, unless they are the same.
     """
     results: list[VariantResult] = []
     for variant, (its, *_) in zip(ablation.variants, flown.values(), strict=True):
@@ -82,12 +82,12 @@ def results_of(
 
 
 def is_claim(ablation: Ablation) -> bool:
-    """Whether trainings are enough for a claim about the method, and not about these policies."""
+    """Whether there are enough trainings for a claim about the method."""
     return len(ablation.config.seeds) >= LEAST_TRAININGS
 
 
 def as_json(ablation: Ablation, results: Sequence[VariantResult]) -> dict[str, Any]:
-    """All numbers, for scripts; intervals as [value, low, high]."""
+    """All numbers for scripts; intervals as [value, low, high]."""
     config = ablation.config
     return {
         "base": config.base,

@@ -1,4 +1,4 @@
-"""An ablation as files: ablation.json, a figure, and README.md with the table."""
+"""Writes an ablation's ablation.json, figure, and README.md with the table."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ _COLOURS = {"better": style.GREEN, "worse": style.VERMILLION, "not distinguishab
 def write_report(
     ablation: Ablation, results: Sequence[VariantResult], folder: Path
 ) -> dict[str, Any]:
-    """All of it; gives the JSON. Raises OSError."""
+    """Write all files; returns the JSON. Raises OSError."""
     style.save(_differences(results), folder / "differences")
     bundle_ids = dict.fromkeys(each.bundle_id for result in results for each in result.bundles)
     return Report(
@@ -39,18 +39,18 @@ def write_report(
 
 
 def no_claim(ablation: Ablation) -> str | None:
-    """What has to be said if trainings are too few."""
+    """A caveat for the report if there are too few trainings."""
     if is_claim(ablation):
         return None
     seeds = len(ablation.config.seeds)
     return (
-        f"{counted(seeds, 'training seed')}: this says something about these "
-        f"policies, but does not support a claim about the method: that needs {LEAST_TRAININGS}"
+        f"{counted(seeds, 'training seed')}: the results hold for these policies, and do not "
+        f"support a claim about the method, which needs {LEAST_TRAININGS}"
     )
 
 
 def _differences(results: Sequence[VariantResult]) -> Figure:
-    """How much each variant's mean cost is above the base's, with its interval."""
+    """Difference of each variant's mean cost from the base's, with its interval."""
     base, *variants = results
     with style.figure(WIDTH_IN, 1.0 + 0.24 * len(variants)) as figure:
         axes = figure.subplots()
@@ -72,7 +72,7 @@ def _differences(results: Sequence[VariantResult]) -> Figure:
         axes.plot([], [], ls="", marker="|", ms=7, color=style.FAINT, label="one seed")
         axes.set_yticks(range(len(variants)), [result.variant.name for result in variants])
         axes.set(
-            xlabel="mean cost at the end / at the start, above the base's; 95 % intervals",
+            xlabel="final / initial cost, mean, minus the base's; 95 % intervals",
             ylim=(len(variants) - 0.5, -0.5),
         )
         tidy(axes)
@@ -83,30 +83,30 @@ def _differences(results: Sequence[VariantResult]) -> Figure:
 def _text(ablation: Ablation, base: Condition) -> str:
     config, worlds, scenario = ablation.config, ablation.worlds, base.scenario
     chosen = (
-        "of the validation set that no weights were chosen by"
+        "of the validation set, none of which selected weights"
         if config.world_set == "validation"
-        else "of the test set, now opened: if you choose by this, it is no test set any more"
+        else "of the test set: if you select by these results, it is no longer a test set"
     )
     claim = no_claim(ablation)
-    said = f"\n\n**{claim[0].upper()}{claim[1:]}.**" if claim else ""
+    caveat = f"\n\n**{claim[0].upper()}{claim[1:]}.**" if claim else ""
     return (
-        "Each variant is the base, except for what its line says. Those that are trained are "
-        f"trained as the base is (seeds: {', '.join(map(str, config.seeds))}), in as many flights, "
-        "states, epochs, rounds and candidates; the others fly the base's policies. All fly over "
+        "Each variant is the base, except for its difference. Trained variants have the base's "
+        f"seeds ({', '.join(map(str, config.seeds))}) and as many flights, states, epochs, rounds "
+        "and candidates; the others fly the base's policies. All fly over "
         f"the {len(worlds)} worlds {worlds.start} to {worlds.stop - 1} {chosen} ({config.set_up}, "
         f"{config.duration_s:g} s), the base with {100.0 * scenario.loss:g} % of messages lost, a "
-        f"delay of {scenario.delay_s:g} s, and payloads in {scenario.payload}. {_FLOWN}{said}"
+        f"delay of {scenario.delay_s:g} s, and payloads in {scenario.payload}. {_FLOWN}{caveat}"
     )
 
 
-_FLOWN = "Points flew."
+_FLOWN = "The robots were points."
 _COLUMNS = ("variant", "", "trained", "mean", "over seeds", "difference from base", "95 %", "")
 _NOTE = (
-    'Cost at the end over that at the start; less is better. "Over seeds" is the standard '
-    "deviation of the trainings' means. The intervals are from a bootstrap that draws worlds in "
-    "pairs, and trainings too: those of a variant and of the base separately, unless they are the "
-    "same. With few trainings the intervals tend to be too narrow; and each stands alone: of "
-    "twenty, one is expected to miss the true value. Each training's folder has its model card."
+    'Final cost over initial cost; less is better. "Over seeds" is the standard deviation of the '
+    "trainings' means. The intervals are from a bootstrap that draws worlds in pairs, and "
+    "trainings: those of a variant and of the base separately, unless they are the same. With few "
+    "trainings the intervals tend to be too narrow. Of twenty intervals, one is expected to miss "
+    "the true value. Each training's folder has its model card."
 )
 
 
@@ -123,7 +123,7 @@ def _rows(ablation: Ablation, results: Sequence[VariantResult]) -> Iterator[list
 
 
 def numbers_of(result: VariantResult) -> tuple[str, str, str, str, str]:
-    """Mean, deviation over seeds, difference to the base, its interval, and the verdict."""
+    """Mean, deviation over seeds, difference from the base, its interval, and the verdict."""
     mean, _, _ = result.mean
     deviation = "" if result.deviation is None else f"{result.deviation:.3f}"
     if result.against_base is None:

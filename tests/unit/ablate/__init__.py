@@ -1,6 +1,6 @@
-"""Trainings, and what they are worth."""
+"""Tests of ablations."""
 
 import torch
 
-# The networks are small: several threads would wait for each other more than they compute.
+# The networks are small: with several threads, synchronisation would cost more than it saves.
 torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""What an ablation means, and what cannot be compared: one line that names key and value."""
+"""Variants of an ablation; an invalid one gives one line with key and value."""
 
 import tomllib
 from pathlib import Path
@@ -33,7 +33,7 @@ fly.clocks = {perception_s = 0.4, policy_s = 0.8}
 
 
 def written(folder: Path, *changes: tuple[str, str], base: str = SMALL) -> Path:
-    """The file with some of its text changed, beside the base's."""
+    """The file with changed text, beside the base's."""
     text = ABLATION
     for old, new in changes:
         assert old in text
@@ -57,12 +57,12 @@ def test_what_it_means(tmp_path: Path) -> None:
             assert config.network["hops"] == hops and config.network["width"] == 4
             assert config.export.name == training.name and config.seed == training.seed
             assert config.data.disturbances.loss == (0.1, 0.6)
-            # The rest of a table that is changed stays.
+            # Other keys of a changed table stay.
             assert config.data.disturbances.lag_s == (0.0, 0.5)
             assert tomllib.loads(training.read.text)["data"]["worlds"][0]["robots"] == [2, 3]
     assert base.condition.scenario.loss == slow.condition.scenario.loss == 0.1
     assert slow.condition.scenario.clocks == Clocks(perception_s=0.4, policy_s=0.8)
-    # Behind the two that weights are chosen by.
+    # After the two worlds that select weights.
     assert ablation.worlds == range(2, 8)
     opened = read_ablation(written(tmp_path, ("worlds = 6", 'worlds = 6\nworld_set = "test"')))
     assert opened.worlds == range(6)
@@ -89,24 +89,24 @@ def test_whatever_a_configuration_says_is_what_the_training_is_told(tmp_path: Pa
         ("duration_s = 1.0", "duration_s = 0.5", "duration_s = 0.5: must be from 1 to 3600"),
         ("fly.loss = 0.1", "fly.loss = 2.0", "base: fly: loss = 2.0: must be from 0 to 1"),
         ("fly.loss = 0.1", "fly.delay = 2.0", "base: fly: unknown key 'delay'; known are "),
-        ('"slow"', '"no-features"', "name = 'no-features': must be one variant's alone"),
-        ('"slow"', '"base"', r"variants\[1\]: name = 'base': is what the variants are held"),
-        ('"slow"', '"clairvoyant-cvt"', r"name = 'clairvoyant-cvt': is what the variants are held"),
+        ('"slow"', '"no-features"', "name = 'no-features': is used twice"),
+        ('"slow"', '"base"', r"variants\[1\]: name = 'base': is reserved for the base"),
+        ('"slow"', '"clairvoyant-cvt"', r"name = 'clairvoyant-cvt': is reserved for the base"),
         ('"slow"', '"a/b"', r"variants\[1\]: name = 'a/b': must be letters, digits"),
         ('"Perception and policy are slow."', '" "', r"variants\[1\]: why = ' ': must be a sent"),
-        ("fly.clocks = ", "# ", r"variants\[1\]: train, fly: one of them must say"),
+        ("fly.clocks = ", "# ", r"variants\[1\]: train and fly are empty"),
         ("fly.clocks = {", "fly.clocks = {jitter = 1, ", "slow: fly: clocks: jitter = 1: must"),
-        ("train.network.hops", "train.seed", "no-features: train.seed: is not to be set: it foll"),
-        ("train.data", "train.export", r"parts\.toml: train.export: is not to be set"),
+        ("train.network.hops", "train.seed", "no-features: train.seed: must not be set: it foll"),
+        ("train.data", "train.export", r"parts\.toml: train.export: must not be set"),
         ("train.network.hops = 0", "train.network.hops = -1", "no-features: network: hops = -1: "),
         ("train.network.hops", "train.hops", "no-features: unknown key 'hops'; known are perc"),
         (
             "train.network.hops = 0", "train.data.flights = 3",
-            "no-features: train.data.flights = 3: must be the base's, 2, or what is compared",
+            "no-features: train.data.flights = 3: must be the base's, 2, for equal compute",
         ),
         (
             "train.network.hops = 0", "train.dagger.rounds = 0",
-            "dagger.rounds = 0: must be .*; without DAgger is dagger.expert_flights = 1",
+            "dagger.rounds = 0: must be .*; dagger.expert_flights = 1 switches DAgger off",
         ),
         ("train.network.hops = 0", "train.fit.epochs = 3", "train.fit.epochs = 3: must be the"),
         ("train.network.hops = 0", "train.data.states = 4", "train.data.states = 4: must be"),

@@ -1,4 +1,4 @@
-"""What is said of the flights of an ablation."""
+"""Results of an ablation's flights."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ SEEDS = ("[0, 4]", "[0, 1, 2]")
 
 
 def results(ablation: Ablation, ends: dict[str, list[float]]) -> list[VariantResult]:
-    """If each variant's trainings end there, of 200 at the start; worlds differ more than they."""
+    """Results of trainings with these final costs (initially 200); worlds differ more than they."""
     bundles = {each.name: TrainedBundle(str(SHIPPED), each.name) for each in ablation.trainings}
     study = study_of(ablation, bundles)
     curves = {flight: CostCurve((0.0, 1.0), (200.0, 0.0), 0.0) for flight in study.flights()}
@@ -39,7 +39,7 @@ def test_who_is_better_and_by_how_much(tmp_path: Path) -> None:
     assert features.verdict == "worse" and features.against_base is not None
     assert features.against_base.difference.value == pytest.approx(19.0 / 200.0)
     assert features.against_base.of_methods
-    # Each policy is better for it, though policies differ by more.
+    # Each policy improves, though policies differ by more.
     assert slow.verdict == "better"
 
 
@@ -54,7 +54,7 @@ def test_trainings_that_differ_more_than_the_variants_tell_nothing(tmp_path: Pat
 def test_few_seeds_are_no_claim(tmp_path: Path) -> None:
     for seeds, text in (("[7]", "1 training seed: "), ("[0, 1]", "2 training seeds: ")):
         said = no_claim(read_ablation(written(tmp_path, ("[0, 4]", seeds))))
-        assert said is not None and said.startswith(f"{text}this says something about these pol")
+        assert said is not None and said.startswith(f"{text}the results hold for these policies")
     assert no_claim(read_ablation(written(tmp_path, SEEDS))) is None
     one = read_ablation(written(tmp_path, ("[0, 4]", "[7]")))
     base, *_ = results(one, {"base": [20], "no-features": [40], "slow": [30]})

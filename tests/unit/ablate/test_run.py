@@ -1,4 +1,4 @@
-"""A whole ablation of seconds: stopped it goes on, and comes to the same."""
+"""A whole ablation in seconds: stopped, it continues to the same result."""
 
 import json
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 class StoppedError(Exception):
-    """Somebody stopped it."""
+    """Stops an ablation."""
 
 
 def quiet(now: AblationProgress) -> None:
@@ -31,7 +31,7 @@ def ablate(ablation: Ablation, folder: Path, tell: Callable[[AblationProgress], 
 
 @pytest.fixture(scope="module", autouse=True)
 def no_cards() -> Iterator[None]:
-    """Drawing the trainings' model cards takes four fifths of the time: tests/unit/train does."""
+    """Skip the model cards, which take four fifths of the time; tests/unit/train draws them."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("lpac.train.run.write_card", lambda *_: None)
         yield
@@ -39,7 +39,7 @@ def no_cards() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def ablated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[AblationProgress]]:
-    """What comes of it if nobody stops it."""
+    """Results of an uninterrupted ablation."""
     folder, told = tmp_path_factory.mktemp("ablated"), list[AblationProgress]()
     ablate(read_ablation(written(folder)), folder / "run", told.append)
     return folder / "run", told
@@ -68,7 +68,7 @@ def test_what_comes_of_it(ablated: tuple[Path, list[AblationProgress]]) -> None:
     assert not told["of_methods"]
     assert (folder / "differences.png").stat().st_size > 5_000
     report = (folder / "README.md").read_text()
-    assert "\n**2 training seeds: this says something about these policies, but does not" in report
+    assert "\n**2 training seeds: the results hold for these policies, and do not" in report
     assert f"| slow | Perception and policy are slow. | no | {slow['mean'][0]:.3f} | " in report
 
 
@@ -84,7 +84,7 @@ def test_how_far_it_is(ablated: tuple[Path, list[AblationProgress]]) -> None:
 def test_stopped_it_goes_on_and_comes_to_the_same(
     ablated: tuple[Path, list[AblationProgress]], tmp_path: Path
 ) -> None:
-    """In the second training, in the last, and among the flights."""
+    """Stop in the second training, in the last, and among the flights."""
     ablation, folder = read_ablation(written(tmp_path)), tmp_path / "run"
     for doing in ("base-4, 2", "no-features-4, 4", "flight 7 of 42"):
 
@@ -98,7 +98,7 @@ def test_stopped_it_goes_on_and_comes_to_the_same(
     assert len(done) == 4
     told: list[AblationProgress] = []
     ablate(ablation, folder, told.append)
-    # Nothing that was done is done again.
+    # Finished work is not repeated.
     assert told[0].doing == "flight 1 of 42"
     assert done == {path: path.stat().st_mtime_ns for path in folder.glob("*/*/bundle.id")}
     flown = (folder / "flights.jsonl").read_text().splitlines()[1:]
@@ -110,7 +110,7 @@ def test_stopped_it_goes_on_and_comes_to_the_same(
 def test_another_configuration_is_another_ablation(
     ablated: tuple[Path, list[AblationProgress]], tmp_path: Path
 ) -> None:
-    """It says so before anything is trained."""
+    """The error comes before any training."""
     other = read_ablation(written(tmp_path, ("hops = 0", "hops = 2")))
     with pytest.raises(ConfigError, match=r"no-features-0: has a run of another configuration"):
         AblationRun(other, ablated[0], quiet)
