@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 from edge.drivers.zenoh_link import ZenohLink
+from edge.identity.envelope import enclose, read_envelope
 from edge.messages.codec import decode, encode
 from edge.messages.mission import RobotStatus
 from edge.messages.topics import STATUS, ReceiveCallback, Topic
@@ -152,7 +153,10 @@ class _ChangedLink:
     def publish(self, topic: Topic, data: bytes) -> None:
         change = self._says.get(self._robot_id)
         if topic is STATUS and change is not None:
-            data = encode(change(decode(RobotStatus, data)))
+            envelope = read_envelope(data)
+            assert envelope is not None
+            status = change(decode(RobotStatus, envelope.payload))
+            data = enclose(encode(status), envelope.head.number)
         self._link.publish(topic, data)
 
 

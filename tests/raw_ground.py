@@ -1,10 +1,12 @@
 """A ground's radio on which a test says what no ground of ours would say."""
 
 import secrets
+import time
 from collections.abc import Callable, Sequence
 from typing import Self
 
 from edge.drivers.zenoh_link import ZenohLink
+from edge.identity.guard import Unguarded
 from edge.messages.codec import encode
 from edge.messages.mission import (
     ORDER_LIFETIME_S,
@@ -14,7 +16,7 @@ from edge.messages.mission import (
     OrderResult,
     RobotStatus,
 )
-from edge.messages.topics import ORDER, STATE, WORLD
+from edge.messages.topics import ORDER, STATE, WORLD, Link
 from lpac.sim.fleet.listener import FleetListener, Statuses
 
 PATIENCE_S = 60.0
@@ -25,13 +27,14 @@ class RawGround:
 
     def __init__(self, fleet: str, connect: Sequence[str], heard: FleetListener) -> None:
         self._heard = heard
-        self._link = ZenohLink(fleet=fleet, listen=("tcp/127.0.0.1:0",), connect=connect)
+        self._radio = ZenohLink(fleet=fleet, listen=("tcp/127.0.0.1:0",), connect=connect)
+        self._link: Link = Unguarded(int(1e3 * time.time())).over(self._radio)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._link.close()
+        self._radio.close()
 
     def order(self, kind: OrderKind, to: RobotStatus, operator: str = "") -> OrderResult:
         """The answer of the program that said `to`; by default as if its commander ordered it."""

@@ -5,7 +5,6 @@ acknowledgement: some are lost, which the policy takes, and ten times as many ro
 channel. Everything else goes over zenoh, by way of the fleet's router.
 """
 
-import itertools
 import math
 import select
 import socket
@@ -19,16 +18,15 @@ from typing import Self
 from edge.core.logger import log
 from edge.core.wire import MAX_ROBOT_ID
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID, ZenohLink
+from edge.identity.envelope import read_head
 from edge.identity.group import (
     TOPICS_OF_GROUP,
     Assembly,
     Fragment,
     GroupKey,
     datagrams,
-    number_in,
     open_datagram,
 )
-from edge.identity.news import MessageNumber
 from edge.messages.admission import Admission
 from edge.messages.topics import CARD, Group, ReceiveCallback, Topic
 
@@ -76,8 +74,6 @@ class MulticastLink:
         self._zenoh = zenoh
         self._callbacks = {t: c for t, c in subscriptions.items() if t in TOPICS_OF_GROUP}
         self._keys = tuple(map(GroupKey.of, group.keys))
-        self._start = int(time.time() * 1e3)
-        self._counts = itertools.count()
         self._own_start = -1  # Of this program, once it has spoken.
         self._assembly = Assembly(math.inf if group.is_secret else _FORGETS_AFTER_S)
         # No robot with a card has a greater one.
@@ -102,15 +98,14 @@ class MulticastLink:
         if topic not in TOPICS_OF_GROUP or self._robot_id is None:
             self._zenoh.publish(topic, data)
             return
-        number = number_in(data) or MessageNumber(self._start, next(self._counts))
-        self._own_start = number.start
+        head = read_head(data)
+        if head is not None:
+            self._own_start = head.number.start
         try:
             self._sender.setsockopt(
                 socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._group.interface)
             )
-            for datagram in datagrams(
-                data, topic=topic, sender=self._robot_id, number=number, key=self._keys[0]
-            ):
+            for datagram in datagrams(data, topic=topic, sender=self._robot_id, key=self._keys[0]):
                 self._sender.sendto(datagram, (self._group.address, self._group.port))
         except (OSError, ValueError) as error:  # No network, a full queue, or too large a message.
             self._failed(f"publish {topic.name}", error)
@@ -186,9 +181,7 @@ class MulticastLink:
         except Exception as error:
             self._failed(f"callback {fragment.topic.name}", error)
             return
-        # Outside the envelope a member may claim another's number to be whatever it likes.
-        is_number = not self._group.is_secret or number_in(message) == fragment.number
-        if is_theirs is not False and is_number:
+        if is_theirs is not False:
             self._assembly.heard(fragment, now_s)
 
     def _is_own(self, fragment: Fragment) -> bool:

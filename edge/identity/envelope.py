@@ -1,30 +1,42 @@
-"""Envelope of every message: its sender, and the sender's signature.
+"""Envelope of every message: its sender, and in a fleet with keys the sender's signature.
 
-Little-endian, 21 bytes before the payload and 64 behind it:
+Little-endian, 29 bytes before the payload, and the signature behind it:
 
 | offset | type | field |
 | --- | --- | --- |
 | 0 | 2 bytes | magic, `LE` |
-| 2 | uint8 | version of this layout, 1 |
-| 3 | 8 bytes | the sender's key, by its fingerprint |
-| 11 | uint48 | the start of its program: each is greater than the last |
-| 17 | uint32 | sequence: each is greater than the last of that start on this topic |
-| 21 | | the payload |
-| -64 | 64 bytes | Ed25519 signature |
+| 2 | uint8 | version of this layout and of what is behind it, 2 |
+| 3 | 4 bytes | the sender's release |
+| 7 | 4 bytes | digest of the sender's list of members; zeros in a fleet without keys |
+| 11 | 8 bytes | the sender's key, by its fingerprint; zeros in a fleet without keys |
+| 19 | uint48 | the start of its program: each is greater than the last |
+| 25 | uint32 | sequence: each is greater than the last of that start on this topic |
+| 29 | | the payload |
+| -64 | 64 bytes | Ed25519 signature; nothing in a fleet without keys |
 
 The signature is over the fleet's authority and the key expression too, so that no message passes
 for one of another fleet, topic or sender.
 """
 
+import hashlib
 import struct
+from importlib.metadata import version
 from typing import NamedTuple
 
+from edge.identity.news import MessageNumber
 from edge.identity.signature import FINGERPRINT_BYTES, SIGNATURE_BYTES, Signer, is_signed
 
+DIGEST_BYTES = 4
+# The release of this program.
+RELEASE = hashlib.sha256(version("lpac-edge").encode()).digest()[:DIGEST_BYTES]
+NO_MEMBERS = bytes(DIGEST_BYTES)
+
 _MAGIC = b"LE"
-_VERSION = 1
-_FIELDS = struct.Struct(f"<2sB{FINGERPRINT_BYTES}s6sI")
-OVERHEAD_BYTES = _FIELDS.size + SIGNATURE_BYTES
+_VERSION = 2
+_FIELDS = struct.Struct(f"<2sB{DIGEST_BYTES}s{DIGEST_BYTES}s{FINGERPRINT_BYTES}s6sI")
+_NO_KEY = bytes(FINGERPRINT_BYTES)
+HEAD_BYTES = _FIELDS.size
+OVERHEAD_BYTES = HEAD_BYTES + SIGNATURE_BYTES
 
 
 class Address(NamedTuple):
@@ -38,21 +50,33 @@ class Address(NamedTuple):
 
     def signed_text(self, sealed: bytes) -> bytes:
         """Bytes that the signature of a message covers."""
-        return b"".join((b"lpac envelope 1\0", self.authority, self.key.encode(), b"\0", sealed))
+        return b"".join((b"lpac envelope 2\0", self.authority, self.key.encode(), b"\0", sealed))
+
+
+class Head(NamedTuple):
+    """The fields before a message's payload."""
+
+    release: bytes
+    members: bytes
+    fingerprint: bytes
+    number: MessageNumber
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether the sender has a key."""
+        return self.fingerprint != _NO_KEY
 
 
 class Envelope(NamedTuple):
     """A message as it came; whether its sender said so is for `is_from` to tell."""
 
-    fingerprint: bytes
-    start: int
-    sequence: int
+    head: Head
     data: bytes
 
     @property
     def payload(self) -> bytes:
         """The payload."""
-        return self.data[_FIELDS.size : -SIGNATURE_BYTES]
+        return self.data[HEAD_BYTES : -SIGNATURE_BYTES if self.head.is_signed else None]
 
     def is_from(self, public_key: bytes, address: Address) -> bool:
         """Whether the key's owner said just that there."""
@@ -60,19 +84,44 @@ class Envelope(NamedTuple):
         return is_signed(address.signed_text(sealed), signature, public_key)
 
 
-def seal(payload: bytes, *, signer: Signer, address: Address, start: int, sequence: int) -> bytes:
-    """The payload in its envelope."""
-    start_bytes = start.to_bytes(6, "little")
-    head = _FIELDS.pack(_MAGIC, _VERSION, signer.fingerprint, start_bytes, sequence)
-    sealed = head + payload
+def seal(
+    payload: bytes,
+    *,
+    signer: Signer,
+    address: Address,
+    number: MessageNumber,
+    members: bytes = NO_MEMBERS,
+    release: bytes = RELEASE,
+) -> bytes:
+    """The payload in its signed envelope."""
+    sealed = _head(release, members, signer.fingerprint, number) + payload
     return sealed + signer.sign(address.signed_text(sealed))
+
+
+def enclose(payload: bytes, number: MessageNumber, *, release: bytes = RELEASE) -> bytes:
+    """The payload in the envelope of a fleet without keys."""
+    return _head(release, NO_MEMBERS, _NO_KEY, number) + payload
+
+
+def _head(release: bytes, members: bytes, fingerprint: bytes, number: MessageNumber) -> bytes:
+    start = number.start.to_bytes(6, "little")
+    return _FIELDS.pack(_MAGIC, _VERSION, release, members, fingerprint, start, number.sequence)
+
+
+def read_head(data: bytes) -> Head | None:
+    """The head at the start of `data`; None if there is none of this version. Raises nothing."""
+    if len(data) < HEAD_BYTES:
+        return None
+    magic, layout, release, members, fingerprint, start, sequence = _FIELDS.unpack_from(data)
+    if magic != _MAGIC or layout != _VERSION:
+        return None
+    number = MessageNumber(int.from_bytes(start, "little"), sequence)
+    return Head(release, members, fingerprint, number)
 
 
 def read_envelope(data: bytes) -> Envelope | None:
     """The envelope in `data`; None if there is none of this version. Raises nothing."""
-    if len(data) < OVERHEAD_BYTES:
+    head = read_head(data)
+    if head is None or (head.is_signed and len(data) < OVERHEAD_BYTES):
         return None
-    magic, version, fingerprint, start, sequence = _FIELDS.unpack_from(data)
-    if magic != _MAGIC or version != _VERSION:
-        return None
-    return Envelope(fingerprint, int.from_bytes(start, "little"), sequence, data)
+    return Envelope(head, data)

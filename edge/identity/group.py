@@ -8,7 +8,7 @@ A datagram, little-endian:
 | offset | type | field |
 | --- | --- | --- |
 | 0 | 2 bytes | magic, `LG` |
-| 2 | uint8 | version of this layout, 1 |
+| 2 | uint8 | version of this layout, 2 |
 | 3 | 4 bytes | the key, by its fingerprint |
 | 7 | 24 bytes | nonce, random |
 | 31 | 16 bytes | Poly1305 authentication tag |
@@ -20,11 +20,10 @@ A fragment:
 | --- | --- | --- |
 | 0 | uint8 | topic, by its number in `TOPICS_OF_GROUP` |
 | 1 | uint16 | the sender's robot id |
-| 3 | uint48 | number of the message: that of its envelope, the start of the program, |
-| 9 | uint32 | and its sequence; or of its own, if it has no envelope |
-| 13 | uint8 | which fragment of the message, from 0 |
-| 14 | uint8 | how many it has |
-| 15 | | its part of the message |
+| 3 | uint8 | which fragment of the message, from 0 |
+| 4 | uint8 | how many it has |
+| 5 | 29 bytes | head of the message's envelope: the same in each of its fragments |
+| 34 | | its part of what is behind that |
 """
 
 import hashlib
@@ -44,7 +43,7 @@ from nacl.bindings import (
 )
 from nacl.exceptions import CryptoError
 
-from edge.identity.envelope import read_envelope
+from edge.identity.envelope import HEAD_BYTES, read_head
 from edge.identity.news import MessageNumber, Newest
 from edge.messages.topics import CARD, MESSAGE, Topic
 
@@ -55,12 +54,12 @@ DATAGRAM_BYTES = 1472
 # What robots tell each other; everything else is for the ground, or by it.
 TOPICS_OF_GROUP = (MESSAGE, CARD)
 
-_MAGIC, _VERSION = b"LG", 1
+_MAGIC, _VERSION = b"LG", 2
 _FINGERPRINT_BYTES, _TAG_BYTES = 4, 16
 _HEAD = struct.Struct(f"<2sB{_FINGERPRINT_BYTES}s{crypto_secretbox_NONCEBYTES}s")
-_FRAGMENT = struct.Struct("<BH6sIBB")
+_FRAGMENT = struct.Struct(f"<BHBB{HEAD_BYTES}s")
 PART_BYTES = DATAGRAM_BYTES - _HEAD.size - _TAG_BYTES - _FRAGMENT.size
-MOST_BYTES = MOST_FRAGMENTS * PART_BYTES
+MOST_BYTES = HEAD_BYTES + MOST_FRAGMENTS * PART_BYTES
 # A sender's fragments come one after another; a fourth message in pieces means that one is lost.
 _MOST_PARTIAL = 3
 # Both topics of each robot of the largest fleet with certificates, and some.
@@ -86,45 +85,41 @@ def key_of_open_fleet(fleet: str) -> bytes:
     return hashlib.sha256(f"lpac open fleet {fleet}".encode()).digest()
 
 
-def number_in(message: bytes) -> MessageNumber | None:
-    """Number in the message's envelope; None if the message has none."""
-    envelope = read_envelope(message)
-    return None if envelope is None else MessageNumber(envelope.start, envelope.sequence)
-
-
 class Fragment(NamedTuple):
     """A part of a message, as a member sent it; `key` is the place of its key among those known."""
 
     key: int
     topic: Topic
     sender: int
-    number: MessageNumber
     place: int
     of: int
+    head: bytes
+    number: MessageNumber
     part: bytes
 
 
-def frames(message_bytes: int) -> int:
+def frames(message_bytes: float) -> int:
     """How many datagrams a message of so many bytes takes; more than three are not sent."""
-    return max(1, math.ceil(message_bytes / PART_BYTES))
+    return max(1, math.ceil((message_bytes - HEAD_BYTES) / PART_BYTES))
 
 
-def datagrams(
-    message: bytes, *, topic: Topic, sender: int, number: MessageNumber, key: GroupKey
-) -> list[bytes]:
-    """The message in datagrams. Raises ValueError for one that takes more than three."""
+def datagrams(message: bytes, *, topic: Topic, sender: int, key: GroupKey) -> list[bytes]:
+    """The message, which has an envelope, in datagrams.
+
+    Raises ValueError for one that takes more than three.
+    """
     count = frames(len(message))
     if count > MOST_FRAGMENTS:
         raise ValueError(f"a message of {len(message)} bytes: a group takes {MOST_BYTES} at most")
-    start = number.start.to_bytes(6, "little")
+    topic_number, envelope_head = TOPICS_OF_GROUP.index(topic), message[:HEAD_BYTES]
     sealed = []
     for place in range(count):
-        part = message[place * PART_BYTES : (place + 1) * PART_BYTES]
-        topic_number = TOPICS_OF_GROUP.index(topic)
-        fragment = _FRAGMENT.pack(topic_number, sender, start, number.sequence, place, count) + part
+        at = HEAD_BYTES + place * PART_BYTES
+        fragment = _FRAGMENT.pack(topic_number, sender, place, count, envelope_head)
         nonce = randombytes(crypto_secretbox_NONCEBYTES)
         head = _HEAD.pack(_MAGIC, _VERSION, key.fingerprint, nonce)
-        sealed.append(head + crypto_secretbox(fragment, nonce, key.secret))
+        part = message[at : at + PART_BYTES]
+        sealed.append(head + crypto_secretbox(fragment + part, nonce, key.secret))
     return sealed
 
 
@@ -140,17 +135,19 @@ def open_datagram(data: bytes, keys: Sequence[GroupKey]) -> Fragment | None:
         opened: bytes = crypto_secretbox_open(data[_HEAD.size :], nonce, keys[which].secret)
     except CryptoError:
         return None
-    topic, sender, start, sequence, place, of = _FRAGMENT.unpack_from(opened)
-    if topic >= len(TOPICS_OF_GROUP) or not place < of <= MOST_FRAGMENTS:
+    topic, sender, place, of, envelope_head = _FRAGMENT.unpack_from(opened)
+    head = read_head(envelope_head)
+    if topic >= len(TOPICS_OF_GROUP) or not place < of <= MOST_FRAGMENTS or head is None:
         return None
-    number = MessageNumber(int.from_bytes(start, "little"), sequence)
     part = opened[_FRAGMENT.size :]
-    return Fragment(which, TOPICS_OF_GROUP[topic], sender, number, place, of, part)
+    return Fragment(
+        which, TOPICS_OF_GROUP[topic], sender, place, of, envelope_head, head.number, part
+    )
 
 
-# Pieces that say otherwise of their message are of another one: its number, of how many pieces it
-# is, and the key.
-_Pieces = tuple[MessageNumber, int, int]
+# Pieces that say otherwise of their message are of another one: its number and the head that it is
+# from, of how many pieces it is, and the key.
+_Pieces = tuple[MessageNumber, bytes, int, int]
 
 
 @dataclass(slots=True)
@@ -168,8 +165,8 @@ class Assembly:
 
     What is not newer than what `heard` was told of is old, and dropped unseen: whatever a stranger
     recorded and says again, and what came twice. So is what comes with a former key from a sender
-    who has the new one: it is who stole the former. Another member may claim any number: it counts
-    once the message is known to be its sender's.
+    who has the new one: it is who stole the former. A number counts once the message is known to be
+    its sender's.
 
     `forget_after_s`: who was silent for longer may have started again with a clock that is behind.
     Members' starts are numbered so that they never are (math.inf).
@@ -192,13 +189,13 @@ class Assembly:
             self.old += 1
             return None
         if fragment.of == 1:
-            return fragment.part
-        which = fragment.number, fragment.of, fragment.key
+            return fragment.head + fragment.part
+        which = fragment.number, fragment.head, fragment.of, fragment.key
         parts = sender.partial.setdefault(which, {})
         parts[fragment.place] = fragment.part
         if len(parts) == fragment.of:
             del sender.partial[which]
-            return b"".join(part for _, part in sorted(parts.items()))
+            return fragment.head + b"".join(part for _, part in sorted(parts.items()))
         if len(sender.partial) > _MOST_PARTIAL:
             # The one that began first: its rest is lost.
             del sender.partial[next(iter(sender.partial))]

@@ -3,6 +3,7 @@
 Who a message is from is decided here, before anything of it is decoded and whatever brought it.
 """
 
+import itertools
 import math
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
@@ -14,7 +15,16 @@ from typing import NamedTuple, Protocol
 
 from edge.core.logger import log
 from edge.identity.card import Card, CardError, Revocations, Role, verified
-from edge.identity.envelope import Address, Envelope, read_envelope, seal
+from edge.identity.envelope import (
+    NO_MEMBERS,
+    RELEASE,
+    Address,
+    Envelope,
+    Head,
+    enclose,
+    read_envelope,
+    seal,
+)
 from edge.identity.news import NOTHING, MessageNumber, Newest
 from edge.identity.signature import Signer
 from edge.messages.topics import (
@@ -43,10 +53,21 @@ _MOST_AHEAD_MS = 24 * 3600e3
 
 
 class Speaker(NamedTuple):
-    """Sender of a message: `name` is its card's, "" where messages are not signed."""
+    """Sender of a message, and its program: `name` is its card's, "" where nothing is signed.
+
+    `number` is the message's; `release` and `members` are what the sender flies and knows.
+    """
 
     role: Role
     name: str
+    number: MessageNumber = NOTHING
+    release: bytes = RELEASE
+    members: bytes = NO_MEMBERS
+
+    @classmethod
+    def of(cls, role: Role, name: str, head: Head) -> "Speaker":
+        """The sender of a message with that head."""
+        return cls(role, name, head.number, head.release, head.members)
 
 
 # Of the key below `lpac/<fleet>/`, the payload and who said it; from any thread.
@@ -124,6 +145,9 @@ class Guard(Protocol):
     def over(self, link: Link) -> Link:
         """Link for the node to publish on, which passes on to this one."""
 
+    def seal(self, topic: Topic, payload: bytes) -> bytes:
+        """The payload in this sender's envelope."""
+
     def introduce(self) -> None:
         """Show others who this is, if it is time; for a node that may have nothing to say."""
 
@@ -147,10 +171,17 @@ class Guard(Protocol):
 
 
 class Unguarded:
-    """Messages go as they are, and are taken for those of the keys that they come on.
+    """Messages are not signed, and are taken for those of the keys that they come on.
 
-    For a radio that nobody else can reach.
+    For a radio that nobody else can reach. `start` tells this start of the program from all before,
+    which were smaller.
     """
+
+    def __init__(self, start: int) -> None:
+        self._start = start
+        # Its `next` cannot be interrupted.
+        self._sequence = itertools.count(1)
+        self._refused = 0
 
     @property
     def role(self) -> None:
@@ -158,11 +189,24 @@ class Unguarded:
 
     def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
         """See `Guard`."""
-        return {topic: partial(_hear_by_key, callback) for topic, callback in hear.items()}
+        return {topic: partial(self._receive, callback) for topic, callback in hear.items()}
 
     def over(self, link: Link) -> Link:
         """See `Guard`."""
-        return link
+        return _SealingLink(self, link)
+
+    def seal(self, topic: Topic, payload: bytes) -> bytes:
+        """See `Guard`."""
+        return enclose(payload, MessageNumber(self._start, next(self._sequence)))
+
+    def _receive(self, hear: Hear, key: str, data: bytes) -> bool:
+        envelope = read_envelope(data)
+        if envelope is None or envelope.head.is_signed:
+            self._refused += 1
+            return False
+        role = Role.ROBOT if key.startswith("robot/") else Role.OPERATOR
+        hear(key, envelope.payload, Speaker.of(role, "", envelope.head))
+        return True
 
     def introduce(self) -> None:
         """See `Guard`."""
@@ -187,14 +231,7 @@ class Unguarded:
 
     def refused(self) -> dict[str, int]:
         """See `Guard`."""
-        return {}
-
-
-_SOME_ROBOT, _SOME_OPERATOR = Speaker(Role.ROBOT, ""), Speaker(Role.OPERATOR, "")
-
-
-def _hear_by_key(hear: Hear, key: str, data: bytes) -> None:
-    hear(key, data, _SOME_ROBOT if key.startswith("robot/") else _SOME_OPERATOR)
+        return {RefusedMessage.NO_ENVELOPE.value: self._refused} if self._refused else {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +322,7 @@ class SignedGuard:
     def over(self, link: Link) -> Link:
         """See `Guard`."""
         self._link = link
-        return _SigningLink(self, link)
+        return _SealingLink(self, link)
 
     def introduce(self) -> None:
         """See `Guard`."""
@@ -348,14 +385,14 @@ class SignedGuard:
     def is_knock(self, data: bytes, place: str) -> bool:
         """See `edge.messages.topics.Knocking`. A robot's own knock, said again, is none."""
         envelope = read_envelope(data)
-        if envelope is None or envelope.fingerprint in self._revoked:
+        if envelope is None or envelope.head.fingerprint in self._revoked:
             return False
         try:
             card = verified(Card, envelope.payload, self._authority)
         except CardError:
             return False
         key = _knock_key(card, place)
-        is_theirs = card.fingerprint == envelope.fingerprint and envelope.is_from(
+        is_theirs = card.fingerprint == envelope.head.fingerprint and envelope.is_from(
             card.public_key, Address(self._authority, key)
         )
         return is_theirs and self._overtaken(key, card, envelope) is None
@@ -363,7 +400,7 @@ class SignedGuard:
     # What goes out
 
     def seal(self, topic: Topic, payload: bytes) -> bytes:
-        """The payload in this member's envelope."""
+        """See `Guard`."""
         return self._seal(self._own_key(topic), payload)
 
     def _seal(self, key: str, payload: bytes) -> bytes:
@@ -374,8 +411,7 @@ class SignedGuard:
             payload,
             signer=self._membership.signer,
             address=Address(self._authority, key),
-            start=self._start,
-            sequence=sequence,
+            number=MessageNumber(self._start, sequence),
         )
 
     def _own_key(self, topic: Topic) -> str:
@@ -425,8 +461,8 @@ class SignedGuard:
         envelope = read_envelope(data)
         if envelope is None:
             return RefusedMessage.NO_ENVELOPE
-        card = self._cards.get(envelope.fingerprint)
-        if envelope.fingerprint in self._revoked:
+        card = self._cards.get(envelope.head.fingerprint)
+        if envelope.head.fingerprint in self._revoked:
             return RefusedMessage.REVOKED
         if card is None:
             self._show_soon = True  # It may know as little of this one.
@@ -438,11 +474,11 @@ class SignedGuard:
         refused = self._overtaken(key, card, envelope)
         if refused is not None:
             return refused
-        return envelope.payload, Speaker(card.role, card.name)
+        return envelope.payload, Speaker.of(card.role, card.name, envelope.head)
 
     def _overtaken(self, key: str, card: Card, envelope: Envelope) -> RefusedMessage | None:
         """Why the member's word does not count, if its number is the reason; else it is heard."""
-        number = MessageNumber(envelope.start, envelope.sequence)
+        number = envelope.head.number
         now_s, offset_s = self._clock_s(), self._unix_offset_s
         unix_s = None if offset_s is None else now_s + offset_s
         # A ground whose computer's clock was wrong once would be out of reach in flight.
@@ -486,7 +522,7 @@ class SignedGuard:
         if not _is_of(card, topic, key):
             return RefusedMessage.NOT_ALLOWED
         address = Address(self._authority, key)
-        if card.fingerprint != envelope.fingerprint or not envelope.is_from(
+        if card.fingerprint != envelope.head.fingerprint or not envelope.is_from(
             card.public_key, address
         ):
             return RefusedMessage.FORGED
@@ -530,10 +566,10 @@ class SignedGuard:
             log.warning("a message is not listened to", why=reason.value, key=key)
 
 
-class _SigningLink:
-    """A link on which everything is signed."""
+class _SealingLink:
+    """A link on which everything is in an envelope."""
 
-    def __init__(self, guard: SignedGuard, link: Link) -> None:
+    def __init__(self, guard: Guard, link: Link) -> None:
         self._guard = guard
         self._link = link
 

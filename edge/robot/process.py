@@ -136,7 +136,7 @@ def run(config: RobotConfig, stop: Stop) -> None:
             ),
             policy,
             world,
-            signed or Unguarded(),
+            signed or Unguarded(int(1e3 * clock.unix_s())),
             boot_nonce=boot_nonce,
             boot_epoch=int(clock.unix_s() * 1e3),
         )
@@ -410,7 +410,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             ),
             policy,
             world,
-            Unguarded() if identity is None else identity.guard(clock.monotonic_s),
+            Unguarded(0) if identity is None else identity.guard(clock.monotonic_s),
             boot_nonce=0,
             boot_epoch=0,
         )

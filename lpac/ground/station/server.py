@@ -71,7 +71,9 @@ class GroundProcess:
             None if identity is None or guard is None
             else partial(identity.keep, guard)
         )  # fmt: skip
-        self._node = GroundNode(config.setup, clock, self, guard or Unguarded())
+        self._node = GroundNode(
+            config.setup, clock, self, guard or Unguarded(int(1e3 * clock.unix_s()))
+        )
         self._members = guard
         self._clients: set[_Client] = set()
         self._world = config.setup.world

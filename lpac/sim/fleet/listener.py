@@ -57,7 +57,7 @@ class FleetListener:
 
     def __enter__(self) -> Self:
         """Raises LinkError."""
-        guard: Guard = Unguarded()
+        guard: Guard = Unguarded(0)
         tls, scheme = None, "tcp"
         if self._identity is not None:
             identity = load_identity(self._identity, fleet=self._fleet, unix_s=time.time())

@@ -301,7 +301,7 @@ class SimulatedRobots:
 
     def _new_guard(self, robot: SimulatedRobot, start: int) -> Guard:
         """Guard that that start of its program speaks and hears through."""
-        return Unguarded()
+        return Unguarded(int(1e3 * robot.clock.unix_s()) + start)
 
     def _next_boot(self) -> int:
         self._boots += 1

@@ -133,11 +133,11 @@ class SimulatedFleet(SimulatedRobots):
         return self._guard(Role.ROBOT, f"r{robot_id}", robot_id, start)
 
     def _guard(self, role: Role, name: str, robot_id: int | None, start: int) -> Guard:
+        start += int(1e3 * self.schedule.unix_s())
         if self.members is None:
-            return Unguarded()
+            return Unguarded(start)
         # As `edge.drivers.identity_folder` numbers the starts of a real program.
-        unix_ms = int(1e3 * self.schedule.unix_s())
-        start = max(start + unix_ms, self._last_start.get(name, 0) + 1)
+        start = max(start, self._last_start.get(name, 0) + 1)
         self._last_start[name] = start
         return self.members.guard(role, name, robot_id, start, self.schedule.monotonic_s)
 

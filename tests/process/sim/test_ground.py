@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from edge.drivers.zenoh_link import ZenohLink
+from edge.identity.guard import Unguarded
 from edge.messages.topics import STATUS
 from lpac.ground.station.client import GroundError, socket_path
 from lpac.ground.station.protocol import Enable, ProblemCode, ResultCode, SetOrigin
@@ -50,7 +51,7 @@ def test_a_status_that_is_none_is_said_and_left_out() -> None:
     ):
 
         def is_said(_: object) -> bool:
-            robot.publish(STATUS, b'{"robot_id": "three"}')
+            robot.publish(STATUS, Unguarded(1).seal(STATUS, b'{"robot_id": "three"}'))
             return bool(said)
 
         assert heard.wait_for(is_said, 60.0)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from edge.identity.card import Role
+from edge.identity.guard import Unguarded
 from edge.messages.codec import encode
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, Order, RobotStatus, SafetyAction
@@ -68,13 +69,9 @@ def attack(field: Field, seal: Seal) -> None:
     field.run(3.0)
 
 
-def as_it_is(_: Topic, data: bytes) -> bytes:
-    return data
-
-
 def test_without_keys_anybody_kills_the_fleet() -> None:
     field = a_field(2, "flying")
-    attack(field, as_it_is)
+    attack(field, Unguarded(STOLEN_START).seal)
     assert not any(status_of(robot).armed for robot in field.robots)
 
 
@@ -84,7 +81,7 @@ def test_with_keys_nobody_else_commands_it(with_the_key_of: str) -> None:
     members = field.fleet.members
     assert members is not None
     if with_the_key_of == "nobody":
-        seal: Seal = as_it_is
+        seal: Seal = Unguarded(STOLEN_START).seal
     else:
         role, name, robot_id = (
             (Role.ROBOT, "r1", 1) if with_the_key_of == "robot 1" else (Role.OBSERVER, "eve", None)
@@ -266,7 +263,8 @@ class Enemy:
         self._rng = rng
         self._field = field
         self._seals: list[Seal] = [
-            as_it_is,
+            lambda _, data: data,
+            Unguarded(STOLEN_START).seal,
             members.guard(Role.ROBOT, "r1", 1, STOLEN_START, lambda: 0.0).seal,
             members.guard(Role.OBSERVER, "eve", None, STOLEN_START, lambda: 0.0).seal,
             others.guard(Role.OPERATOR, "alice", None, STOLEN_START, lambda: 0.0).seal,

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import pytest
 
+from edge.identity.envelope import HEAD_BYTES
 from edge.identity.guard import Unguarded
 from edge.messages.codec import decode, encode
 from edge.messages.mission import GroundState
@@ -32,7 +33,7 @@ class Ground:
 
     def publish(self, topic: Topic, data: bytes) -> None:
         if topic == STATE:
-            self.said.append((self.now_s, decode(GroundState, data)))
+            self.said.append((self.now_s, decode(GroundState, data[HEAD_BYTES:])))
 
     def is_claimed(self, _: int) -> bool:
         return False
@@ -56,7 +57,7 @@ class Ground:
 def flown(robots: int, duration_s: float) -> tuple[Ground, GroundNode]:
     """A ground that commands, and hears of each robot twice a second, of all at their own times."""
     ground = Ground()
-    node = GroundNode(setup(robots), ground, ground, Unguarded())
+    node, robot_guard = GroundNode(setup(robots), ground, ground, Unguarded(1)), Unguarded(1)
     node.attach(ground)
     hear = node.subscriptions[STATUS]
     node.station.take_command()
@@ -67,7 +68,7 @@ def flown(robots: int, duration_s: float) -> tuple[Ground, GroundNode]:
                 # Ten moments in a second, of which each robot has two.
                 if (2 * tick + late - robot) % 5 == 0:
                     said = status(robot, uptime_s=ground.now_s, sequence=tick)
-                    hear(f"robot/{robot}/status", encode(said))
+                    hear(f"robot/{robot}/status", robot_guard.seal(STATUS, encode(said)))
         ground.now_s = TICK_S * (tick + 1)
         node.tick()
     return ground, node

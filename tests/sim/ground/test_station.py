@@ -848,7 +848,7 @@ def test_a_second_station_of_a_name_leaves_the_fleet_to_the_first(robots: int) -
     field = a_field(robots, "flying")
     fleet = field.fleet
     twin = SimulatedGround(
-        field.stations["alice"].setup, fleet.schedule, fleet.radio, -7, Unguarded()
+        field.stations["alice"].setup, fleet.schedule, fleet.radio, -7, Unguarded(1)
     )
     # Each hears the robots, and not the other.
     field.air = replace(field.air, partition=(frozenset({-1}), frozenset({-7})))

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from edge.identity.envelope import OVERHEAD_BYTES
+from edge.identity.guard import Unguarded
 from edge.messages.codes import CheckCode, Reason, ReasonCode
 from edge.messages.topics import MESSAGE, STATE, Topic
 from edge.robot.pac import message_bytes
@@ -25,7 +26,7 @@ def node_is(**fields: Any) -> Callable[[SimulatedRobot], None]:
 
 def hears_nonsense(robot: SimulatedRobot) -> None:
     assert robot.node is not None
-    robot.node.subscriptions[STATE]("ground/0/state", b"?")
+    robot.node.subscriptions[STATE]("ground/0/state", Unguarded(1).seal(STATE, b"?"))
 
 
 def watchdog_dies(robot: SimulatedRobot) -> None:
@@ -108,7 +109,7 @@ def test_what_it_publishes_and_logs_in_ten_seconds_of_flight() -> None:
     assert beacon.gps_accuracy_m == pytest.approx(said.gps_accuracy_m, abs=0.01)
     assert beacon.flown_s == pytest.approx(said.flown_s, abs=1.0)
     # Neither beacon nor map is taken from somebody else than it names.
-    other.subscriptions[MESSAGE]("robot/5/message", last["message"])
+    other.subscriptions[MESSAGE]("robot/5/message", node._guard.seal(MESSAGE, last["message"]))
     other.control_step()
     assert other._inbox.not_understood == ("robot 5",)
     assert other.status_step({}).message_counts["other_sender"] == 1

@@ -497,7 +497,7 @@ def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
     assert again.node.station.state.robot_safety_actions == {"1": "hold"}
     # Another one observes, also of the same name, on another computer.
     other = fleet.join("other")
-    twin = SimulatedGround(again.setup, fleet.schedule, fleet.radio, -9, Unguarded())
+    twin = SimulatedGround(again.setup, fleet.schedule, fleet.radio, -9, Unguarded(1))
     again.carry_out(_pass(5.0))
     assert (other.node.station.commands, other.node.station.commander) == (False, "operator")
     assert again.node.station.commands and not twin.node.station.commands

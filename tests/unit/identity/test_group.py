@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.identity.envelope import Address, seal
+from edge.identity.envelope import HEAD_BYTES, enclose
 from edge.identity.group import (
     DATAGRAM_BYTES,
     MOST_BYTES,
@@ -16,49 +16,50 @@ from edge.identity.group import (
     datagrams,
     frames,
     key_of_open_fleet,
-    number_in,
     open_datagram,
 )
 from edge.identity.news import MessageNumber
-from edge.identity.signature import Signer
 from edge.messages.topics import CARD, MESSAGE
 
 KEY, FORMER, ANOTHER = (GroupKey.of(bytes([n]) * 32) for n in range(3))
 numbers = st.builds(MessageNumber, st.integers(0, 2**48 - 1), st.integers(0, 2**32 - 1))
-messages = st.integers(0, MOST_BYTES).map(lambda size: bytes(n % 251 for n in range(size)))
+payloads = st.integers(0, MOST_BYTES - HEAD_BYTES).map(
+    lambda size: bytes(n % 251 for n in range(size))
+)
 
 
 def sent(
-    message: bytes,
+    payload: bytes,
     sequence: int = 1,
     *,
     sender: int = 7,
     start: int = 1,
     key: GroupKey = KEY,
 ) -> list[bytes]:
-    number = MessageNumber(start, sequence)
-    return datagrams(message, topic=MESSAGE, sender=sender, number=number, key=key)
+    message = enclose(payload, MessageNumber(start, sequence))
+    return datagrams(message, topic=MESSAGE, sender=sender, key=key)
 
 
 def put_together(assembly: Assembly, pieces: Sequence[bytes], *, heard: bool = True) -> list[bytes]:
-    """What came out."""
-    messages = []
+    """Payloads that came out."""
+    payloads = []
     for piece in pieces:
         fragment = open_datagram(piece, (KEY, FORMER))
         assert fragment is not None
         message = assembly.add(fragment, 0.0)
         if message is not None:
-            messages.append(message)
+            payloads.append(message[HEAD_BYTES:])
             if heard:
                 assembly.heard(fragment, 0.0)
-    return messages
+    return payloads
 
 
-@given(messages, st.integers(0, 2**16 - 1), numbers, st.sampled_from([KEY, FORMER]), st.randoms())
+@given(payloads, st.integers(0, 2**16 - 1), numbers, st.sampled_from([KEY, FORMER]), st.randoms())
 def test_a_message_comes_out_as_it_went_in(
-    message: bytes, sender: int, number: MessageNumber, key: GroupKey, random: object
+    payload: bytes, sender: int, number: MessageNumber, key: GroupKey, random: object
 ) -> None:
-    pieces = datagrams(message, topic=CARD, sender=sender, number=number, key=key)
+    message = enclose(payload, number)
+    pieces = datagrams(message, topic=CARD, sender=sender, key=key)
     assert len(pieces) == frames(len(message)) <= 3
     assert all(len(piece) <= DATAGRAM_BYTES for piece in pieces)
     random.shuffle(pieces)  # type: ignore[attr-defined]
@@ -66,7 +67,7 @@ def test_a_message_comes_out_as_it_went_in(
     for fragment in fragments:
         assert fragment is not None
         assert (fragment.topic, fragment.sender, fragment.number) == (CARD, sender, number)
-    assert put_together(Assembly(), pieces) == [message]
+    assert put_together(Assembly(), pieces) == [payload]
 
 
 def test_of_a_message_in_pieces_there_is_all_or_nothing() -> None:
@@ -120,8 +121,7 @@ def test_pieces_that_do_not_belong_to_a_message_do_not_spoil_it() -> None:
     short, long, wrong = b"short", b"l" * 2000, b"w" * 3000
     for genuine in (short, long):
         for key in (KEY, FORMER):
-            pieces = datagrams(wrong, topic=MESSAGE, sender=7, number=number, key=key)
-            put_together(assembly, pieces[1:2])
+            put_together(assembly, sent(wrong, number.sequence, key=key)[1:2])
         [message] = put_together(assembly, sent(genuine, number.sequence))
         assert message == genuine
         number = number._replace(sequence=number.sequence + 1)
@@ -164,13 +164,10 @@ def test_an_open_fleets_robot_may_come_back_with_an_earlier_clock() -> None:
         assert comes_through(assembly, 1, start=1, now_s=5.1) is comes
 
 
-def test_the_number_is_the_envelopes() -> None:
-    sealed = seal(
-        b"hello", signer=Signer(b"s" * 32), address=Address(b"a", "robot/7/message"), start=3,
-        sequence=4,
-    )  # fmt: skip
-    assert number_in(sealed) == MessageNumber(3, 4)
-    assert number_in(b"hello" * 40) is None
+def test_what_has_no_envelope_does_not_come_through() -> None:
+    for message in (b"", b"hello" * 40):
+        (piece,) = datagrams(message, topic=MESSAGE, sender=7, key=KEY)
+        assert open_datagram(piece, (KEY,)) is None
 
 
 def test_a_key_is_32_bytes_and_fleets_without_keys_are_kept_apart() -> None:

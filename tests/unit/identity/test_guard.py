@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from edge.identity.card import Card, CardError, Revocations, Role, signed
 from edge.identity.envelope import OVERHEAD_BYTES
 from edge.identity.guard import CardProblem, Membership, SignedGuard, Speaker, Unguarded
+from edge.identity.news import MessageNumber
 from edge.identity.signature import Signer
 from edge.messages.topics import (
     CARD,
@@ -129,7 +130,9 @@ def test_a_member_shows_its_card_and_is_heard_as_itself(one: Member) -> None:
     # Unknown as long as its card was not heard; then at once.
     assert not one.takes(MESSAGE, "robot/2/message", message)
     one.hear(two, sent)
-    assert one.heard == [("robot/2/message", b"hello", Speaker(Role.ROBOT, "r2"))]
+    assert one.heard == [
+        ("robot/2/message", b"hello", Speaker(Role.ROBOT, "r2", MessageNumber(1, 2)))
+    ]
     assert one.guard.refused() == {"unknown_key": 1}
     # Who hears somebody new shows its own card soon.
     assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
@@ -234,7 +237,7 @@ def test_two_programs_with_one_key_are_told_from_a_new_start(one: Member, two: M
 
     # What was on its way when the program started again, and then a second program.
     both_speak(4.0)
-    assert one.guard.robots_said_twice() == Unguarded().robots_said_twice() == set()
+    assert one.guard.robots_said_twice() == Unguarded(1).robots_said_twice() == set()
     both_speak(8.0)
     assert one.guard.robots_said_twice() == {2}
     one.now_s += 6.0
@@ -306,9 +309,9 @@ def test_an_observer_says_a_hold_and_nothing_else(one: Member) -> None:
         one.hear(member, sent[:1])
         said = [sent[1], *(member.say(topic, b"other")[-1] for topic in (ORDER, STATE))]
         assert [one.takes(t, member.key(t), data) for t, data in said] == heard
-    assert [speaker for *_, speaker in one.heard] == [
-        Speaker(Role.OBSERVER, "guest"),
-        *[Speaker(Role.OPERATOR, "ann")] * 3,
+    assert [(speaker.role, speaker.name) for *_, speaker in one.heard] == [
+        (Role.OBSERVER, "guest"),
+        *[(Role.OPERATOR, "ann")] * 3,
     ]
 
 
@@ -360,7 +363,7 @@ def test_a_revoked_key_is_not_heard_and_a_list_only_grows(one: Member, two: Memb
     assert REVOKED not in dict(observer.say(STATE, b""))
     one._topics[REVOKED]("ground/revoked", lists[2])
     assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"3"))
-    assert one.guard.revoked_robots() == Unguarded().revoked_robots() == set()
+    assert one.guard.revoked_robots() == Unguarded(1).revoked_robots() == set()
 
 
 def test_a_card_must_be_the_keys_beside_it() -> None:
@@ -375,14 +378,18 @@ def test_a_card_must_be_the_keys_beside_it() -> None:
 
 def test_without_a_guard_a_message_is_its_keys() -> None:
     heard: list[tuple[str, bytes, Speaker]] = []
-    topics = Unguarded().subscriptions(
-        dict.fromkeys((MESSAGE, STATE), lambda *said: heard.append(said))
-    )
-    topics[MESSAGE]("robot/3/message", b"m")
-    topics[STATE]("ground/state", b"s")
-    assert [speaker for *_, speaker in heard] == [
-        Speaker(Role.ROBOT, ""), Speaker(Role.OPERATOR, ""),
-    ]  # fmt: skip
+    guard = Unguarded(5)
+    topics = guard.subscriptions(dict.fromkeys((MESSAGE, STATE), lambda *said: heard.append(said)))
+    assert topics[MESSAGE]("robot/3/message", guard.seal(MESSAGE, b"m"))
+    assert topics[STATE]("ground/state", guard.seal(STATE, b"s"))
+    assert heard == [
+        ("robot/3/message", b"m", Speaker(Role.ROBOT, "", MessageNumber(5, 1))),
+        ("ground/state", b"s", Speaker(Role.OPERATOR, "", MessageNumber(5, 2))),
+    ]
+    # What is not in an envelope, or in a member's.
+    for data in (b"m", robot(3).guard.seal(MESSAGE, b"m")):
+        assert not topics[MESSAGE]("robot/3/message", data)
+    assert len(heard) == 2 and guard.refused() == {"no_envelope": 2}
 
 
 def test_the_link_itself_is_asked_for_the_rest(one: Member) -> None:

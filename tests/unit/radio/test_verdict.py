@@ -123,7 +123,7 @@ def test_a_slow_rate_has_less_room() -> None:
 def test_a_channel_that_is_too_small_for_these_robots_is_a_problem() -> None:
     slow = verdict(checked(wifi=wifi(rate_mbit_s=6.0)), heard())
     assert slow.problems == (
-        "by the model these 10 robots ask in flight for 235 % of the channel, of which they can "
+        "by the model these 10 robots ask in flight for 236 % of the channel, of which they can "
         "use 60 %: it carries 5",
     )
     assert slow.sentence == slow.problems[0]
