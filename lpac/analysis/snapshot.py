@@ -9,6 +9,8 @@ from edge.messages.mission import FlightState, GroundState, Place, RobotStatus
 
 # A robot that said nothing for longer is not heard any more.
 FRESH_S = 2.0
+# A commander that was silent for longer is gone.
+COMMANDER_SILENT_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)

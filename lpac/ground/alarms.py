@@ -1,10 +1,10 @@
 """Alarms for the operator, of all that the ground knows; nothing here has a clock."""
 
 import math
-from collections import Counter, deque
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import StrEnum
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 from edge.core.arrivals import Arrivals
 from edge.core.counted import counted
@@ -18,8 +18,8 @@ from edge.messages.codes import (
     texts,
 )
 from edge.messages.mission import AIRBORNE, FlightState, RobotStatus
-from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
-from lpac.ground.station.station import COMMANDER_SILENT_S
+from lpac.analysis.commonest import commonest
+from lpac.analysis.snapshot import COMMANDER_SILENT_S, FleetSetup, FleetSnapshot, RobotSnapshot
 from lpac.radio.pairs import LATE_S, Blame, Link, blame
 
 Severity = Literal["critical", "warning", "note"]
@@ -48,8 +48,6 @@ _IN_TIME, _LEAST_SENT = 0.7, 10
 _CLOCK_WITHIN_S = 1.0
 _ID = 8
 _NAMES = 4
-
-T = TypeVar("T", bound=Hashable)
 
 
 class AlarmCode(StrEnum):
@@ -167,8 +165,8 @@ class _Fleet:
             if robot.status is not None
         ]
         self.fresh = [seen for seen in self.seen if seen.robot.fresh]
-        self.world = _most_common(s.status.world_id for s in self.fresh) or setup.world_id
-        self.origin = _most_common(s.status.origin for s in self.fresh if s.status.origin)
+        self.world = commonest(s.status.world_id for s in self.fresh) or setup.world_id
+        self.origin = commonest(s.status.origin for s in self.fresh)
         self.fence = setup.fence
         if self.ground is not None:
             self.world = self.ground.world_id or self.world
@@ -207,11 +205,6 @@ def _hears_well(robot: RobotSnapshot, status: RobotStatus, sender: int) -> bool:
     arrivals = Arrivals.of_counts(robot.arrivals.get(key, ()))
     in_time = arrivals.arrived - arrivals.older_than(LATE_S)
     return arrivals.sent < _LEAST_SENT or in_time >= _IN_TIME * arrivals.sent
-
-
-def _most_common(values: Iterable[T]) -> T | None:
-    counts = Counter(values).most_common(1)
-    return counts[0][0] if counts else None
 
 
 def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:

@@ -17,6 +17,7 @@ from edge.messages.mission import (
     is_too_low,
     world_id,
 )
+from lpac.analysis.snapshot import COMMANDER_SILENT_S
 from lpac.ground.station.protocol import (
     CommandProgress,
     CommandReport,
@@ -38,7 +39,8 @@ from lpac.ground.station.protocol import (
     TakeCommand,
     Takeoff,
 )
-from lpac.ground.station.station import COMMANDER_SILENT_S, Station, is_down, next_trial
+from lpac.ground.station.station import Station, is_down
+from lpac.ground.station.wishes import next_trial
 
 DEFECT = Problem(ProblemCode.DEFECT, "a defect of lpac ground ended this command")
 
@@ -118,7 +120,7 @@ class CommandTask:
         self._steps.close()
         if withdraw:
             for order_id in self._orders.values():
-                self._station.withdraw(order_id)
+                self._station.orders.withdraw(order_id)
         self._fail(self._open, _C.ABANDONED, f"abandoned: {why}")
         self._end()
 
@@ -135,7 +137,7 @@ class CommandTask:
                 text = f"robot {name!r} is unknown; known are {', '.join(robots)}"
                 raise _ProblemError(ProblemCode.UNKNOWN_ROBOT, text)
         urgent = _is_everybodys(self.request) and not isinstance(self.request, TakeCommand)
-        while not station.listened or not (urgent or self._are_gathered()):
+        while not station.election.listened or not (urgent or self._are_gathered()):
             yield
         # Who sits in a slot is known only now.
         self.names = _addressed(station, self.request)
@@ -162,8 +164,8 @@ class CommandTask:
     def _refuse_who_may_not(self) -> None:
         """Raises _ProblemError if this station's operator may not ask for it."""
         station = self._station
-        commander = station.commander
-        if not station.may_command and not _is_hold(self.request):
+        commander = station.election.commander
+        if not station.election.may_command and not _is_hold(self.request):
             text = f"{station.operator} is an observer of this fleet: it may ask for hold alone"
             raise _ProblemError(ProblemCode.MAY_NOT, text)
         if station.card_problem is not None and isinstance(self.request, (Takeoff, Start)):
@@ -175,7 +177,7 @@ class CommandTask:
         own = station.commands or commander in ("", station.operator)
         if own or _is_everybodys(self.request):
             return
-        silent = station.commander_age_s > COMMANDER_SILENT_S
+        silent = station.election.commander_age_s > COMMANDER_SILENT_S
         raise _ProblemError(
             ProblemCode.OTHER_COMMANDS,
             f"{commander} commands the fleet{', and is silent' if silent else ''}: "
@@ -230,11 +232,11 @@ class CommandTask:
         return heard
 
     def _obeys(self, status: RobotStatus, sequence: int = 0) -> bool:
-        commander = self._station.commander
+        commander = self._station.election.commander
         return status.operator == commander and status.obeyed_sequence >= sequence
 
     def _not_obeying(self, status: RobotStatus) -> tuple[ResultCode, str]:
-        other = status.operator and status.operator != self._station.commander
+        other = status.operator and status.operator != self._station.election.commander
         text = f"obeys {status.operator}" if other else "does not hear this station"
         return _C.NOT_OBEYING, text
 
@@ -324,7 +326,7 @@ class CommandTask:
 
     def _learn_world(self, request: SetWorld) -> Waits:
         """Of the fleet nothing changes."""
-        self._station.remember_world(request.text)
+        self._station.worlds.remember(request.text)
         yield from self._have_world(0, request)
 
     def _places(self, request: SetPlaces) -> Waits:
@@ -428,7 +430,7 @@ class CommandTask:
     def _reach(self) -> Waits:
         """Before orders: each robot obeys this station, or has failed."""
         station = self._station
-        station.take_command()
+        station.election.take_command()
         yield from self._obeyed()
         twice = [name for name in self._open if station.is_duplicate(name)]
         self._fail(twice, _C.DUPLICATE_ID, "two programs say that they are this robot")
@@ -444,7 +446,7 @@ class CommandTask:
         """Wait for the robots' answers to their orders."""
         while self._open:
             for name in self._open:
-                answer = self._station.results.get(self._orders[name])
+                answer = self._station.orders.results.get(self._orders[name])
                 if answer is not None:
                     if answer.refusal is None:
                         self._settle(name, done)
@@ -569,7 +571,7 @@ class CommandTask:
     def _look_at_climb(self, name: str, ordered_s: float) -> None:
         """Settle a takeoff that is over."""
         status = self._status(name)
-        answer = self._station.results.get(self._orders[name])
+        answer = self._station.orders.results.get(self._orders[name])
         late = self._station.now_s - ordered_s > _CLIMB_S
         if answer is not None and answer.refusal is not None:
             self._refuse(name, answer.refusal)
@@ -606,7 +608,7 @@ class CommandTask:
             now_s = self._station.now_s
             for name, status in heard.items():
                 order_id = self._orders.get(name, "")
-                answer = self._station.results.get(order_id)
+                answer = self._station.orders.results.get(order_id)
                 if answer is not None and answer.refusal is not None:
                     refusals[name] = answer.refusal
                     again_s[name] = now_s + _START_AGAIN_S
@@ -701,10 +703,10 @@ class CommandTask:
     def _command(self, _: TakeCommand) -> Waits:
         station = self._station
         until_s = station.now_s + _OBEY_S
-        station.take_command()
+        station.election.take_command()
         while heard := self._heard():
             # Somebody else may change something at the same moment.
-            station.take_command()
+            station.election.take_command()
             for name, status in heard.items():
                 if self._obeys(status):
                     self._settle(name, f"obeys {station.operator}")
@@ -765,7 +767,7 @@ class Commands:
 
     def step(self) -> None:
         """Time has passed, or something was heard."""
-        why, self._station.interruption = self._station.interruption, ""
+        why, self._station.election.interruption = self._station.election.interruption, ""
         for running in self._running:
             if why and self._is_interrupted(running.request):
                 running.abandon(why, withdraw=True)

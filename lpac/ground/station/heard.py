@@ -1,16 +1,18 @@
 """Statuses of a fleet's robots, as a ground station hears them.
 
-Pure: time is passed in. Robots are kept by id and boot nonce, that is by the start of a program.
+Pure: it is as late as it was told. Robots are kept by id and boot nonce, that is by the start of a
+program.
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from edge.core.arrivals import Arrivals
 from edge.messages.mission import FlightState, RadioCounts, RobotStatus
-from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
+from lpac.analysis.snapshot import FRESH_S, EventKind, RobotSnapshot
+from lpac.ground.rendering import state_and_reason
 
 # Two statuses of one program, of which one is lost, are at most so far apart, unless it has ended.
 _STATUS_GAP_S = 1.2
@@ -18,10 +20,14 @@ _RATE_WINDOW_S = 3.0
 # In which a share of messages can be told.
 _ARRIVALS_WINDOW_S = 10.0
 
-# Of a robot's name and a text, when it comes, falls silent, or starts again.
-TellPresence = Callable[[str, str], None]
-# Of a robot's name, its new state, and a text.
-TellState = Callable[[str, FlightState, str], None]
+
+class Tell(Protocol):
+    """Keeps an event for the clients."""
+
+    def __call__(
+        self, kind: EventKind, robot: str, text: str, operator: str = "",
+        state: FlightState | None = None,
+    ) -> None: ...  # fmt: skip
 
 
 class _HeardStatus(NamedTuple):
@@ -130,16 +136,22 @@ class HeardRobots:
     """All robots of the fleet, by their ids, of which `robots` holds each name's."""
 
     def __init__(
-        self, robots: Mapping[str, int], tell_presence: TellPresence, tell_state: TellState
+        self, robots: Mapping[str, int], now_s: float, unix_now_s: float, tell: Tell
     ) -> None:
         self.names = {robot_id: name for name, robot_id in robots.items()}
+        self.now_s, self.unix_now_s = now_s, unix_now_s
+        self._began_s = now_s
         self._robots = {id_: _Robot(name, id_) for id_, name in self.names.items()}
         # By what their messages' envelopes tell: who is there twice, though one alone is heard.
         self.said_twice: frozenset[int] = frozenset()
-        self._tell_presence = tell_presence
-        self._tell_state = tell_state
+        self._tell = tell
 
-    def hear(self, status: RobotStatus, now_s: float, unix_now_s: float) -> bool:
+    @property
+    def age_s(self) -> float:
+        """How long they have been listened to, s."""
+        return self.now_s - self._began_s
+
+    def hear(self, status: RobotStatus) -> bool:
         """Whether that is a newer status of a robot's program than was known.
 
         It is not if the robot is of no name here, or if another program is that robot.
@@ -148,55 +160,58 @@ class HeardRobots:
         if robot is None:
             return False
         before = None if robot.program is None else robot.program.newest.status
-        if not robot.take(_HeardStatus(now_s, status.unix_time_s - unix_now_s, status)):
+        if not robot.take(_HeardStatus(self.now_s, status.unix_time_s - self.unix_now_s, status)):
             return False
         if before is not None and before.boot_nonce != status.boot_nonce:
-            self._tell_presence(robot.name, "its program has started again")
+            self._tell("presence", robot.name, "its program has started again")
         if before is None or (before.state, before.reason) != (status.state, status.reason):
-            self._tell_state(robot.name, status.state, f"{status.state}: {status.reason.text}")
-        self._look_at(robot, now_s)
+            self._tell("state", robot.name, state_and_reason(status), state=status.state)
+        self._look_at(robot)
         return True
 
-    def look(self, now_s: float) -> None:
+    def look(self) -> None:
         """Time has passed: see who fell silent, and who is there twice."""
         for robot in self._robots.values():
-            self._look_at(robot, now_s)
+            self._look_at(robot)
 
-    def _look_at(self, robot: _Robot, now_s: float) -> None:
-        present = robot.fresh(now_s) is not None
+    def _look_at(self, robot: _Robot) -> None:
+        present = robot.fresh(self.now_s) is not None
         if present != robot.present:
             robot.present = present
-            self._tell_presence(robot.name, "heard" if present else f"silent for {FRESH_S:g} s")
-        duplicate = robot.two_speak(now_s) or robot.robot_id in self.said_twice
+            text = "heard" if present else f"silent for {FRESH_S:g} s"
+            self._tell("presence", robot.name, text)
+        duplicate = robot.two_speak(self.now_s) or robot.robot_id in self.said_twice
         if duplicate and not robot.duplicate:
-            self._tell_presence(robot.name, "two programs say that they are this robot")
+            self._tell("presence", robot.name, "two programs say that they are this robot")
         robot.duplicate = duplicate
 
-    def status(self, robot_id: int, now_s: float) -> RobotStatus | None:
+    def status(self, robot_id: int) -> RobotStatus | None:
         """The robot's newest, if it was heard within `FRESH_S`."""
-        return self._robots[robot_id].fresh(now_s)
+        return self._robots[robot_id].fresh(self.now_s)
 
-    def last(self, robot_id: int, now_s: float) -> tuple[RobotStatus, float] | None:
+    def last(self, robot_id: int) -> tuple[RobotStatus, float] | None:
         """The robot's newest status, however old, and its age, s; None if it was never heard."""
         program = self._robots[robot_id].program
-        return None if program is None else (program.newest.status, now_s - program.newest.at_s)
+        return (
+            None if program is None else (program.newest.status, self.now_s - program.newest.at_s)
+        )
 
-    def others(self, robot_id: int, now_s: float) -> list[tuple[RobotStatus, float]]:
+    def others(self, robot_id: int) -> list[tuple[RobotStatus, float]]:
         """The same of each other program that says it is this robot, if it is still heard."""
-        return self._robots[robot_id].others(now_s)
+        return self._robots[robot_id].others(self.now_s)
 
-    def statuses(self, now_s: float) -> dict[int, RobotStatus]:
+    def statuses(self) -> dict[int, RobotStatus]:
         """The newest of each robot that was heard within `FRESH_S`, by robot id."""
-        fresh = ((id_, robot.fresh(now_s)) for id_, robot in self._robots.items())
+        fresh = ((id_, robot.fresh(self.now_s)) for id_, robot in self._robots.items())
         return {robot_id: status for robot_id, status in fresh if status is not None}
 
     def is_duplicate(self, robot_id: int) -> bool:
         """Whether two programs say that they are this robot."""
         return self._robots[robot_id].duplicate
 
-    def snapshots(self, now_s: float) -> tuple[RobotSnapshot, ...]:
+    def snapshots(self) -> tuple[RobotSnapshot, ...]:
         """State of each, in the fleet's order."""
-        return tuple(robot.snapshot(now_s) for robot in self._robots.values())
+        return tuple(robot.snapshot(self.now_s) for robot in self._robots.values())
 
 
 def _rates_hz(first: RobotStatus, last: RobotStatus) -> dict[str, float]:

@@ -164,7 +164,7 @@ class GroundNode:
             return
         try:
             if topic == STATE.name:
-                self.station.hear_state(decode(GroundState, data), speaker)
+                self.station.election.hear_state(decode(GroundState, data), speaker)
             elif topic == HOLD.name:
                 self.station.hear_hold(decode(Hold, data), speaker)
             elif topic == WORLD.name:
@@ -200,7 +200,7 @@ class GroundNode:
     def _to_publish(self) -> tuple[int | None, Hold | None, int]:
         station = self.station
         sequence = station.state.sequence if station.commands and station.state else None
-        return sequence, station.published_hold, len(station.published_orders())
+        return sequence, station.published_hold, len(station.orders.pending)
 
     def _publish(self) -> None:
         station = self.station
@@ -221,7 +221,7 @@ class GroundNode:
                 self._link.publish(HOLD, encode(hold))
             if state is not None or hold is not None:
                 self._state_at_s = now_s
-        for order in station.published_orders():
+        for order in station.orders.pending:
             self._link.publish(ORDER, encode(order))
         world = station.published_world()
         if world is not None and now_s - self._world_at_s >= _WORLD_PERIOD_S:

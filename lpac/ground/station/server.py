@@ -187,9 +187,9 @@ class GroundProcess:
     def _recall(self) -> None:
         station = self._node.station
         with suppress(OSError, UnicodeDecodeError):
-            station.remember_world(self._world_path.read_text("utf-8-sig"))
+            station.worlds.remember(self._world_path.read_text("utf-8-sig"))
         with suppress(OSError, MessageError):
-            station.remember(decode(GroundState, self._state_path.read_bytes()))
+            station.election.remember(decode(GroundState, self._state_path.read_bytes()))
 
     # Clients
 

@@ -185,9 +185,9 @@ class SimulatedGround:
         """Know what the one before left on its disk."""
         self._commanded, self._world = former._commanded, former._world
         if self._world:
-            self.node.station.remember_world(self._world)
+            self.node.station.worlds.remember(self._world)
         if self._commanded is not None:
-            self.node.station.remember(self._commanded)
+            self.node.station.election.remember(self._commanded)
 
     @property
     def setup(self) -> FleetSetup:

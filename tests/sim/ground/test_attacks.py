@@ -190,7 +190,7 @@ def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
     field.run(1.0)
     field.begin(SafetyCommand("hold"), "bob")
     field.until(lambda: {robot.state for robot in honest} == {_S.HOLD}, 3.0)
-    assert bob.commander == "alice" and alice.commands
+    assert bob.election.commander == "alice" and alice.commands
     # What sets robots in motion waits for those who do not obey, for a while.
     field.begin(Resume())
     field.until(lambda: {robot.state for robot in honest} == {_S.MISSION}, 10.0)

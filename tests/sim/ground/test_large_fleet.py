@@ -60,7 +60,7 @@ def flown(robots: int, duration_s: float) -> tuple[Ground, GroundNode]:
     node, robot_guard = GroundNode(setup(robots), ground, ground, Unguarded(1)), Unguarded(1)
     node.attach(ground)
     hear = node.subscriptions[STATUS]
-    node.station.take_command()
+    node.station.election.take_command()
     for tick in range(round(duration_s / TICK_S)):
         for late in range(2):
             ground.now_s = TICK_S * (tick + late / 2)

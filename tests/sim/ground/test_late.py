@@ -74,7 +74,7 @@ def test_a_ground_that_takes_over_leaves_robots_blind_for_a_moment_only() -> Non
     field = a_field(2, "flying")
     field.join("bob")
     field.run(2.0)
-    field.stations["bob"].take_command()
+    field.stations["bob"].election.take_command()
     blind = 0
     for _ in range(50):
         field.run(0.1)

@@ -33,7 +33,8 @@ from lpac.ground.station.protocol import (
     TakeCommand,
     Takeoff,
 )
-from lpac.ground.station.station import Station, next_trial
+from lpac.ground.station.station import Station
+from lpac.ground.station.wishes import next_trial
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import SimulatedGround
 from tests.said import not_done, problem
@@ -494,7 +495,7 @@ def test_of_two_orders_the_later_expires_later() -> None:
         now_s += pause_s
         station.set_time(now_s, 1e9 + now_s)
         station.order("reset", "r0")
-        expiry_s = station.published_orders()[-1].expires_at_uptime_s
+        expiry_s = station.orders.pending[-1].expires_at_uptime_s
         assert last_s < expiry_s <= heard.uptime_s + now_s + ORDER_LIFETIME_S
         last_s = expiry_s
 
@@ -508,7 +509,7 @@ def test_all_programs_of_one_robot_are_killed() -> None:
     assert (field.robots[1].state, second.state) == (_S.FAULT, _S.FAULT)
     assert not field.robots[1].vehicle.armed
     field.run(12.0)
-    assert not field.stations["alice"].published_orders()
+    assert not field.stations["alice"].orders.pending
 
 
 def test_two_programs_of_one_robot_settle_nothing() -> None:
@@ -599,7 +600,7 @@ def test_a_station_started_again_remembers_what_robots_do_not_say() -> None:
     bob = field.stations["bob"].state
     field.leave("bob")
     after = field.restart("alice", 1.5)
-    after.remember(before)
+    after.election.remember(before)
     field.run(5.0)
     assert after.commands
     assert after.state is not None
@@ -694,7 +695,7 @@ def test_a_station_does_not_take_over_from_one_that_only_robots_hear() -> None:
     bob = field.join("bob")
     field.cut(("alice",), ("bob",))
     field.run(10.0)
-    assert (bob.commands, bob.commander) == (False, "alice")
+    assert (bob.commands, bob.election.commander) == (False, "alice")
     assert problem(field.do(Start(), "bob")) is ProblemCode.OTHER_COMMANDS
     assert field.operators() == {"alice"}
     # It may hold, still.
@@ -722,14 +723,14 @@ def test_stations_that_do_not_hear_each_other() -> None:
     assert field.states() == {_S.HOLD}
     field.run(2.0)
     assert field.states() == {_S.HOLD}
-    assert (bob.commands, bob.commander) == (False, "alice")
+    assert (bob.commands, bob.election.commander) == (False, "alice")
     assert problem(field.do(Start(), "bob")) is ProblemCode.OTHER_COMMANDS
     # Who is told so by robots alone does not say that it commands.
     field.done(TakeCommand(), "bob")
     takeoff = field.begin(Takeoff())
     field.run(2.0)
     assert takeoff.report is not None
-    assert (alice.commands, alice.commander) == (False, "bob")
+    assert (alice.commands, alice.election.commander) == (False, "bob")
     assert field.operators() == {"bob"}
     field.done(SafetyCommand("hold"))
 
@@ -738,7 +739,7 @@ def test_who_does_not_command_holds_and_nothing_else() -> None:
     field = a_field(3, "flying")
     bob = field.join("bob")
     field.run(2.0)
-    assert (bob.commands, bob.commander) == (False, "alice")
+    assert (bob.commands, bob.election.commander) == (False, "alice")
     for request in (SafetyCommand("return"), Start(), Resume(), Takeoff(), Enable(on=False),
                     SetOrigin(ORIGIN), NextTrial(), RobotCommand("disarm", ("r0",))):  # fmt: skip
         assert problem(field.do(request, "bob")) is ProblemCode.OTHER_COMMANDS
@@ -759,7 +760,7 @@ def test_who_does_not_command_holds_and_nothing_else() -> None:
     # Whoever lands robots commands from then on.
     field.done(SafetyCommand("land", robots=("r1",)), "bob")
     assert field.each_state() == [_S.FAULT, _S.LAND, _S.MISSION]
-    assert (alice.commands, alice.commander) == (False, "bob")
+    assert (alice.commands, alice.election.commander) == (False, "bob")
 
 
 def test_an_observer_may_ask_for_hold_alone() -> None:
@@ -775,7 +776,7 @@ def test_an_observer_may_ask_for_hold_alone() -> None:
     # When nobody commands any more, robots do by themselves what is safe.
     field.leave("alice")
     field.until(lambda: field.states() == {_S.LANDED}, 120.0)
-    assert not eve.commands and eve.commander == "alice"
+    assert not eve.commands and eve.election.commander == "alice"
 
 
 def test_an_observers_hold_ends_a_takeoff() -> None:
@@ -828,17 +829,17 @@ def test_two_stations_of_a_name_are_an_alarm_and_end_nobody() -> None:
     twin = Station(alice.setup, field.now_s, 1e9)
     state = alice.published_state()
     assert state is not None
-    twin.hear_state(state, ANYBODY)
-    assert twin.shares_name and not twin.commands
+    twin.election.hear_state(state, ANYBODY)
+    assert twin.election.shares_name and not twin.commands
     # A state of its own former life that says less is no other's.
-    alice.hear_state(replace(state, sequence=state.sequence - 1), ANYBODY)
-    assert alice.commands and not alice.shares_name
-    alice.hear_state(replace(state, sequence=state.sequence + 1), ANYBODY)
-    assert alice.shares_name and not alice.commands
+    alice.election.hear_state(replace(state, sequence=state.sequence - 1), ANYBODY)
+    assert alice.commands and not alice.election.shares_name
+    alice.election.hear_state(replace(state, sequence=state.sequence + 1), ANYBODY)
+    assert alice.election.shares_name and not alice.commands
     (alarm, *_) = alarms(alice.setup, alice.snapshot())
     assert (alarm.severity, alarm.code) == ("critical", AlarmCode.NAME_SHARED)
     # Its operator decides.
-    alice.take_command()
+    alice.election.take_command()
     assert alice.commands and alice.state is not None
     assert alice.state.sequence == state.sequence + 2
 
@@ -852,7 +853,7 @@ def test_a_second_station_of_a_name_leaves_the_fleet_to_the_first(robots: int) -
     )
     # Each hears the robots, and not the other.
     field.air = replace(field.air, partition=(frozenset({-1}), frozenset({-7})))
-    field.until(lambda: twin.node.station.shares_name, 10.0)
+    field.until(lambda: twin.node.station.election.shares_name, 10.0)
     assert not twin.node.station.commands
     assert twin.node.station.published_state() is None
     field.run(5.0)
@@ -905,7 +906,7 @@ def test_stations_agree_whatever_they_are_told(
     # In the end one commands, all know who, and the robots obey it.
     field.run(5.0)
     assert sum(station.commands for station in field.stations.values()) == 1
-    (commander,) = {station.commander for station in field.stations.values()}
+    (commander,) = {station.election.commander for station in field.stations.values()}
     assert field.operators() == {commander}
     # Whoever holds then, all hold.
     field.do(SafetyCommand("hold"), NAMES[seed % 3])

@@ -499,7 +499,10 @@ def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
     other = fleet.join("other")
     twin = SimulatedGround(again.setup, fleet.schedule, fleet.radio, -9, Unguarded(1))
     again.carry_out(_pass(5.0))
-    assert (other.node.station.commands, other.node.station.commander) == (False, "operator")
+    assert (other.node.station.commands, other.node.station.election.commander) == (
+        False,
+        "operator",
+    )
     assert again.node.station.commands and not twin.node.station.commands
 
 

@@ -1,0 +1,47 @@
+"""Places of robots in the flight, as the ground gives them and as the robots have them."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+from edge.messages.mission import Place, RobotStatus
+from lpac.analysis.snapshot import FleetSetup
+
+_AT_PLACE_M = 0.01
+
+
+def with_places(
+    setup: FleetSetup, places: Mapping[str, Place], names: Mapping[int, str]
+) -> FleetSetup:
+    """The setup with robots in other slots; `places` is by robot id, as in a state."""
+    if not places:
+        return setup
+    seated = {place.slot: (names.get(int(r), ""), place) for r, place in places.items()}
+    slots = []
+    for slot in setup.slots:
+        robot, place = slot.robot, slot.place
+        if slot.place.slot in seated:
+            robot, place = seated[slot.place.slot]
+        elif robot and str(setup.robots[robot]) in places:
+            robot = ""  # It was given another place.
+        slots.append(replace(slot, place=place, robot=robot))
+    return replace(setup, slots=tuple(slots))
+
+
+def places_of(setup: FleetSetup, statuses: Iterable[RobotStatus]) -> dict[str, Place]:
+    """The places of those that do not have their configured one."""
+    configured = {setup.robots[s.robot]: s.place for s in setup.slots if s.robot}
+    places = {}
+    for status in statuses:
+        above_m = status.slot_height_m - setup.base_height_m
+        try:
+            place = Place(max(0, round(above_m / setup.slot_spacing_m)), status.landing_point_m)
+        except ValueError:  # It says what no place is.
+            continue
+        known = configured.get(status.robot_id)
+        there = known is not None and (
+            math.dist(status.landing_point_m, known.landing_point_m) < _AT_PLACE_M
+        )
+        if known is None or known.slot != place.slot or not there:
+            places[str(status.robot_id)] = place
+    return places
