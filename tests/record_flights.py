@@ -38,6 +38,7 @@ from lpac.sim.fleet.layout import ORIGIN, Settings
 from lpac.sim.fleet.robots import SimulatedRobot
 from lpac.sim.fleet.simulated import SimulatedFleet
 from lpac.sim.px4.modes import MavResult, Px4Mode
+from lpac.sim.px4.vector import vector
 from lpac.sim.px4.vehicle import Px4Vehicle, SimulatedSensor
 from lpac.sim.scenario import Scenario
 from tests.conftest import ROOT, SHIPPED
@@ -473,7 +474,7 @@ def _wind_over_the_fence(f: _Flight) -> None:
     # Towards the nearest line, and over it.
     f.vehicle.position_m = f.vehicle.position_m + _to_the_line_m(f)
     f.run(1.0)
-    f.vehicle.wind_m_s = 3.0 * _outwards(f)
+    f.vehicle.wind_m_s = vector(3.0 * _outwards(f))
     f.run(8.0)
 
 

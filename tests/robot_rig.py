@@ -78,7 +78,7 @@ def new_vehicle(**parameters: float) -> Px4Vehicle:
     transform = ORIGIN.frame().relative_to(ORIGIN.latitude_deg, ORIGIN.longitude_deg)
     north_m, east_m, _ = transform.mission_to_local(np.array([*PAD_M, 0.0])).tolist()
     vehicle = Px4Vehicle(seed=1, start_m=(north_m, east_m), ready_after_s=0.0)
-    vehicle.gps_bias_m = np.zeros(3)
+    vehicle.gps_bias_m = (0.0, 0.0, 0.0)
     vehicle.parameters |= {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0, **parameters}
     vehicle.parameters |= {"MPC_LAND_SPEED": 1.5, "COM_DISARM_LAND": 0.5}
     return vehicle

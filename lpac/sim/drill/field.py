@@ -10,6 +10,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.fence import Fence
+from edge.core.vehicle import Vector
 from edge.flight.margins import ErrorBudget
 from lpac.analysis.flight import FaultRecord, FlightRecord, GivenOrder
 from lpac.analysis.logs import simulated_name
@@ -28,6 +29,7 @@ from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.flight import Timeline
 from lpac.sim.drill.injections import Do, FenceWithout, Injection, OperatorOrders, OrderedKind
 from lpac.sim.fleet.layout import Layout
+from lpac.sim.px4.vector import level
 from lpac.sim.scenario import WORLD_SENSOR, Scenario
 
 # Receivers with corrections, whose estimates still wander by 0.15 m along each axis, and heights
@@ -170,9 +172,9 @@ class FaultyFleet(ABC):
 
     # Where vehicles are
 
-    def outwards(self, robot: int) -> F64:
-        """(2,): the way to what it takes to be the fence's nearest line, north and east."""
-        return self.layout.way_out(self.vehicles[robot].estimated_position_m)[0]
+    def outwards(self, robot: int) -> Vector:
+        """In the plane: the way to what it takes to be the fence's nearest line."""
+        return level(self.layout.way_out(self.vehicles[robot].estimated_position_m)[0].tolist())
 
     def inside_m(self, robot: int) -> float:
         """How far inside that line the vehicle takes itself to be."""

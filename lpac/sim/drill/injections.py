@@ -12,8 +12,10 @@ from typing import Literal, Protocol
 import numpy as np
 
 from edge.core import F64
+from edge.core.vehicle import Vector
 from lpac.sim.fleet.pilot import PilotedVehicle
 from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.vector import ZERO, minus, plus, times
 from lpac.sim.px4.vehicle import Px4Vehicle, SimulatedSensor
 from lpac.sim.px4.wire import MavlinkWire
 
@@ -27,8 +29,8 @@ class Surroundings(Protocol):
     Robots count on from the last to the first.
     """
 
-    def outwards(self, robot: int) -> F64:
-        """(2,): the way to the nearest line of the fence."""
+    def outwards(self, robot: int) -> Vector:
+        """In the plane: the way to the nearest line of the fence."""
         ...
 
     def inside_m(self, robot: int) -> float:
@@ -116,7 +118,7 @@ class ReceiverJumps(VehicleInjection):
     by_m: float
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_jump_m = np.array([*(self.by_m * around.outwards(robot)), 0.0])
+        vehicle.gps_jump_m = times(around.outwards(robot), self.by_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,9 +138,9 @@ class ReceiverLies(VehicleInjection):
     scatter_m: float = 0.0
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        outwards = np.array([*around.outwards(robot), 0.0])
-        vehicle.receiver.creep_m_s = self.creep_m_s * outwards
-        vehicle.receiver.velocity_bias_m_s = self.velocity_bias_m_s * outwards
+        outwards = around.outwards(robot)
+        vehicle.receiver.creep_m_s = times(outwards, self.creep_m_s)
+        vehicle.receiver.velocity_bias_m_s = times(outwards, self.velocity_bias_m_s)
         vehicle.receiver.scatter_m = self.scatter_m
 
 
@@ -161,8 +163,8 @@ class EstimateDrifts(VehicleInjection):
     down_m_s: float = 0.0
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        north_east = -self.inwards_m_s * around.outwards(robot)
-        vehicle.gps_drift_m_s = np.array([*north_east, self.down_m_s])
+        north, east, _ = times(around.outwards(robot), -self.inwards_m_s)
+        vehicle.gps_drift_m_s = north, east, self.down_m_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +174,7 @@ class HeightJumps(VehicleInjection):
     up_m: float
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_offset_m = vehicle.gps_offset_m - np.array([0.0, 0.0, self.up_m])
+        vehicle.gps_offset_m = minus(vehicle.gps_offset_m, (0.0, 0.0, self.up_m))
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,8 +184,8 @@ class EstimateJumpsOut(VehicleInjection):
     beyond_m: float
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        jump_m = (around.inside_m(robot) + self.beyond_m) * around.outwards(robot)
-        vehicle.gps_offset_m = vehicle.gps_offset_m + np.array([*jump_m, 0.0])
+        jump_m = times(around.outwards(robot), around.inside_m(robot) + self.beyond_m)
+        vehicle.gps_offset_m = plus(vehicle.gps_offset_m, jump_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +193,7 @@ class EstimateIsRight(VehicleInjection):
     """End the estimator's error: its position jumps back."""
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_offset_m = np.zeros(3)
+        vehicle.gps_offset_m = ZERO
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +224,7 @@ class WindBlows(VehicleInjection):
     gusts_m_s: float = 0.0
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.wind_m_s = np.array([*(self.outwards_m_s * around.outwards(robot)), 0.0])
+        vehicle.wind_m_s = times(around.outwards(robot), self.outwards_m_s)
         vehicle.gust_m_s = self.gusts_m_s
 
 
@@ -293,7 +295,7 @@ class PilotFlies(PilotInjection):
     up_m_s: float = 0.0
 
     def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
-        north, east = (self.outwards_m_s * around.outwards(robot)).tolist()
+        north, east, _ = times(around.outwards(robot), self.outwards_m_s)
         vehicle.pilot(Px4Mode.POSCTL, (north, east, -self.up_m_s))
 
 

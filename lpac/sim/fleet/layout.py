@@ -18,6 +18,7 @@ from lpac.fleet.settings import Places
 from lpac.fleet.writer import assign, write_fleet, write_robot
 from lpac.sim.description import FIELD_SCALE, fence_around, robot_table
 from lpac.sim.px4.errors import Errors
+from lpac.sim.px4.vector import ZERO
 from lpac.sim.px4.vehicle import GPS_ACCURACY_M, Px4Vehicle
 from lpac.sim.px4.world import WorldOrigin
 from lpac.sim.scenario import Scenario
@@ -222,7 +223,8 @@ class Layout:
         # Both places of a vehicle and its pad: a vehicle's bias is drawn before it has a place.
         biases_m = np.zeros((robots, 2))
         if self.scenario.errors:
-            biases_m = np.array([self._horizontal(Px4Vehicle(seed=s).gps_bias_m) for s in seeds])
+            drawn_m = [np.array(Px4Vehicle(seed=seed).gps_bias_m) for seed in seeds]
+            biases_m = np.array([self._horizontal(bias_m) for bias_m in drawn_m])
         pads_m = self._draw_pads(biases_m[None])
         headings_rad = np.random.default_rng(seeds).uniform(0.0, math.tau, robots).tolist()
         vehicles = []
@@ -233,7 +235,7 @@ class Layout:
                 errors=self._errors(seed),
             )  # fmt: skip
             if not self.scenario.errors:
-                vehicle.gps_bias_m = np.zeros(3)
+                vehicle.gps_bias_m = ZERO
                 # Half of the position error at worst, as a receiver with corrections tells.
                 vehicle.gps_told_m = min(GPS_ACCURACY_M[0], self.scenario.budget.gps_m / 2.0)
             vehicles.append(vehicle)

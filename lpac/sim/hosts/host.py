@@ -15,6 +15,7 @@ from lpac.sim.fleet.layout import ORIGIN, WORLD
 from lpac.sim.hosts.rack import Rack
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.server import Instance, Px4Server
+from lpac.sim.px4.vector import ZERO
 from lpac.sim.px4.vehicle import Px4Vehicle
 
 # Three releases of an image fit.
@@ -165,7 +166,7 @@ class SimulatedHost:
             seed=self.robot_id, start_m=(north_m, east_m), heading_rad=math.radians(
                 ORIGIN.heading_deg), origin=WORLD,
         )  # fmt: skip
-        vehicle.gps_bias_m = np.zeros(3)
+        vehicle.gps_bias_m = ZERO
         vehicle.parameters.update(self._parameters)
         return vehicle
 

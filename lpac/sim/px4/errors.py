@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge.core import F64
 from edge.core.vehicle import Vector
-from lpac.sim.px4.vector import plus, times, vector
+from lpac.sim.px4.vector import plus, times
 
 # Of the whole horizontal error of a receiver.
 LEAST_BIAS_M, GREATEST_BIAS_M = 1.0, 5.0
@@ -127,12 +126,12 @@ class Errors:
             for _ in range(2)
         ]
 
-    def position_m(self, time_s: float, bias_m: F64) -> Vector:
+    def position_m(self, time_s: float, bias_m: Vector) -> Vector:
         """North, east, down: what the estimate errs by, of a receiver that began with a bias.
 
-        `bias_m` is (3,); a receiver without any horizontal one does not walk.
+        A receiver without any horizontal bias does not walk.
         """
-        north_m, east_m, down_m = vector(bias_m)
+        north_m, east_m, down_m = bias_m
         if began_m := math.hypot(north_m, east_m):
             length_m = min(max(began_m + self._walk[0].at(time_s), LEAST_BIAS_M), GREATEST_BIAS_M)
             turn_rad = self._walk[1].at(time_s) / began_m

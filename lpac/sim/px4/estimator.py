@@ -129,7 +129,7 @@ class Estimator:
         self._time_s = time_s
         if has_gps:
             # Mostly there is nothing to follow, and never was.
-            self._followed_once = self._followed_once or any(off_m) or any(off_m_s)
+            self._followed_once = self._followed_once or off_m != ZERO or off_m_s != ZERO
             if self._followed_once:
                 self._follow(off_m, off_m_s, dt_s)
             if self._gps_lost_since_s < math.inf:

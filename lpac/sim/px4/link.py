@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
-import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from lpac.sim.px4.checks import Component, Px4Event
@@ -160,6 +159,7 @@ class Px4Link:
         self._default_rates_hz = {message: rate_hz for message, (rate_hz, _) in streams.items()}
         self._intervals_s: dict[int, float] = {}
         self._due_s = dict.fromkeys(streams, vehicle.time_s)
+        self._next_due_s = vehicle.time_s
         for message, rate_hz in self._default_rates_hz.items():
             self._intervals_s[message] = 0.0
             self._set_interval(message, 1.0 / rate_hz if rate_hz else math.inf)
@@ -247,11 +247,13 @@ class Px4Link:
                 self._send_parameter(name)
             del self._parameters_to_send[:PARAMETERS_AT_ONCE]
         now_s = vehicle.time_s + 1e-6
-        for message in [each for each, due_s in self._due_s.items() if due_s <= now_s]:
-            # A late message does not make the next one early.
-            next_s = self._due_s[message] + self._intervals_s[message]
-            self._due_s[message] = max(next_s, now_s)
-            self._send_now(message)
+        if self._next_due_s <= now_s:
+            for message in [each for each, due_s in self._due_s.items() if due_s <= now_s]:
+                # A late message does not make the next one early.
+                next_s = self._due_s[message] + self._intervals_s[message]
+                self._due_s[message] = max(next_s, now_s)
+                self._send_now(message)
+            self._next_due_s = min(self._due_s.values())
         messages, self._out = self._out, []
         for message in messages:
             self._link_number += 1
@@ -295,6 +297,7 @@ class Px4Link:
             last_s = self.vehicle.time_s
         self._intervals_s[message_id] = interval_s
         self._due_s[message_id] = last_s + interval_s
+        self._next_due_s = min(self._due_s.values())
 
     # Streams
 
@@ -436,7 +439,7 @@ class Px4Link:
         home, home_m = self.vehicle.global_home, self.vehicle.home_m
         if home is None or home_m is None:
             return None
-        local_m = minus(home_m, self.vehicle.estimator_origin_m.tolist())
+        local_m = minus(home_m, self.vehicle.estimator_origin_m)
         no_rotation, no_approach = [1.0, 0.0, 0.0, 0.0], [math.nan] * 3
         return mavlink.MAVLink_home_position_message(
             *_as_integers(home), *local_m, no_rotation, *no_approach, self._boot_ms() * 1000
@@ -528,7 +531,7 @@ class Px4Link:
         vehicle = self.vehicle
         return mavlink.MAVLink_local_position_ned_message(
             self._boot_ms(),
-            *minus(vehicle.estimate_m(), vehicle.estimator_origin_m.tolist()),
+            *minus(vehicle.estimate_m(), vehicle.estimator_origin_m),
             *vehicle.estimate_m_s(),
         )
 
@@ -679,15 +682,13 @@ class Px4Link:
         if message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
             return
         values = [message.x, message.y, message.z, message.vx, message.vy, message.vz]
-        commanded = [
+        x, y, z, vx, vy, vz = [
             math.nan if message.type_mask >> bit & 1 or not math.isfinite(value) else value
             for bit, value in enumerate(values)
         ]
         no_yaw = message.type_mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
         yaw_rad = math.nan if no_yaw or not math.isfinite(message.yaw) else message.yaw
-        self.vehicle.offboard(
-            Px4Setpoint(np.array(commanded[:3]), np.array(commanded[3:]), yaw_rad)
-        )
+        self.vehicle.offboard(Px4Setpoint((x, y, z), (vx, vy, vz), yaw_rad))
 
     # Parameters
 

@@ -1,54 +1,46 @@
 """Ways in which a simulated GPS receiver tells what is not so, and its vehicle does not know."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import numpy as np
-
-from edge.core import F64
 from edge.core.vehicle import Vector
-from lpac.sim.px4.vector import ZERO, level, minus, plus, times, total
-
-
-def _zeros() -> F64:
-    return np.zeros(3)
+from lpac.sim.px4.vector import ZERO, Draws, level, minus, plus, times, total
 
 
 @dataclass(eq=False)
 class Receiver:
     """Faults of one receiver: a test may set `stuck` and what follows at any time.
 
-    `stuck`: it repeats its last place, with a velocity of 0, as a fresh fix. `creep_m_s` (3,) is
-    how fast its places walk off, unlike what its velocity says, `velocity_bias_m_s` (3,) what its
+    `stuck`: it repeats its last place, with a velocity of 0, as a fresh fix. `creep_m_s` is
+    how fast its places walk off, unlike what its velocity says, `velocity_bias_m_s` what its
     velocity is wrong by, and `scatter_m` the standard deviation of its places, each by itself.
     North, east, down.
     """
 
     stuck: bool = False
-    creep_m_s: F64 = field(default_factory=_zeros)
-    velocity_bias_m_s: F64 = field(default_factory=_zeros)
+    creep_m_s: Vector = ZERO
+    velocity_bias_m_s: Vector = ZERO
     scatter_m: float = 0.0
     _crept_m: Vector = ZERO
     _scattered_m: Vector = ZERO
     _stuck_at_m: Vector | None = None
 
-    def step(self, dt_s: float, fix_m: Callable[[], Vector], rng: np.random.Generator) -> None:
+    def step(self, dt_s: float, fix_m: Callable[[], Vector], draws: Draws) -> None:
         """One step of time; `fix_m` gives what it would tell."""
         if not self.stuck:
             self._stuck_at_m = None
         elif self._stuck_at_m is None:
             self._stuck_at_m = fix_m()
-        creep_m_s = self.creep_m_s.tolist()
-        if any(creep_m_s):
-            self._crept_m = plus(self._crept_m, times(creep_m_s, dt_s))
+        if self.creep_m_s != ZERO:
+            self._crept_m = plus(self._crept_m, times(self.creep_m_s, dt_s))
         if self.scatter_m:
-            self._scattered_m = level(times(rng.standard_normal(3).tolist(), self.scatter_m))
+            self._scattered_m = level(times(draws.take(3), self.scatter_m))
 
     @property
     def lies(self) -> bool:
         """Whether the place or the velocity that it tells is wrong."""
-        misplaces = (self._crept_m, self._scattered_m) != (ZERO, ZERO)
-        return self._stuck_at_m is not None or misplaces or any(self.velocity_bias_m_s.tolist())
+        wrong = (self._crept_m, self._scattered_m, self.velocity_bias_m_s)
+        return self._stuck_at_m is not None or wrong != (ZERO, ZERO, ZERO)
 
     def place_m(self, true_m: Vector) -> Vector:
         """The place that it tells; `true_m` if it is honest."""
@@ -60,7 +52,7 @@ class Receiver:
         """The velocity that it tells."""
         if self._stuck_at_m is not None:
             return ZERO
-        return plus(true_m_s, self.velocity_bias_m_s.tolist())
+        return plus(true_m_s, self.velocity_bias_m_s)
 
     def off_m(self, true_m: Vector) -> Vector:
         """How far its place is off in the plane. Heights go by the barometer."""

@@ -5,6 +5,8 @@ The results are those of numpy's element-wise operations, to the last bit.
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from edge.core import F64
 from edge.core.vehicle import Vector
 
@@ -40,3 +42,26 @@ def times(a: Sequence[float], factor: float) -> Vector:
 def level(a: Sequence[float]) -> Vector:
     """The part in the plane."""
     return a[0], a[1], 0.0
+
+
+class Draws:
+    """The generator's standard normal numbers one after another, which it makes in blocks.
+
+    To ask it for a few of them takes ten times as long.
+    """
+
+    _BLOCK = 1000
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._drawn: list[float] = []
+        self._at = 0
+
+    def take(self, count: int) -> list[float]:
+        """The next ones."""
+        if self._at + count > len(self._drawn):
+            self._drawn[: self._at] = []
+            self._drawn += self._rng.standard_normal(self._BLOCK).tolist()
+            self._at = 0
+        self._at += count
+        return self._drawn[self._at - count : self._at]

@@ -48,7 +48,7 @@ from lpac.sim.px4.modes import (
 )
 from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.receiver import Receiver
-from lpac.sim.px4.vector import ZERO, level, minus, plus, times, total, vector
+from lpac.sim.px4.vector import ZERO, Draws, level, minus, plus, times, total, vector
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
@@ -108,11 +108,11 @@ class Airframe:
 class Px4Setpoint:
     """An offboard setpoint in the local frame; NaN where an axis is not commanded.
 
-    position_m (3,), velocity_m_s (3,): north, east, down. yaw_rad: NaN keeps the heading.
+    North, east, down. yaw_rad: NaN keeps the heading.
     """
 
-    position_m: F64
-    velocity_m_s: F64
+    position_m: Vector
+    velocity_m_s: Vector
     yaw_rad: float = math.nan
 
 
@@ -180,10 +180,10 @@ class Px4Vehicle:
     """One vehicle; deterministic for a seed, its steps and its commands.
 
     Fields that a test may set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard
-    deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `gps_jump_m` (3,)
+    deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `gps_jump_m`
     (its fix is off by that much at once, and the estimator must see what to make of it, as of the
     other faults of its `receiver`),
-    `gps_offset_m` and `gps_drift_m_s` (3,) (what fix and estimate are off besides, and how that
+    `gps_offset_m` and `gps_drift_m_s` (what fix and estimate are off besides, and how that
     goes on; no bound keeps it), `compass_jump_rad`,
     `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
     and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
@@ -210,13 +210,13 @@ class Px4Vehicle:
         place of the estimator's origin. Without `errors` the bias stays as it is, the compass is
         right, the air stands still and a voltage does not sag.
         """
-        self._rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(seed)
         self._world = origin or WorldOrigin()
         self._airframe = airframe or Airframe()
-        drawn_ready_s = float(self._rng.uniform(3.0, 6.0))
-        bearing_rad, share = self._rng.uniform(0.0, math.tau), self._rng.uniform()
-        self.gps_bias_m: F64 = np.array(
-            [*draw_bias_m(share, bearing_rad), self._rng.uniform(-1.5, 1.5)]
+        drawn_ready_s = float(rng.uniform(3.0, 6.0))
+        bearing_rad, share = rng.uniform(0.0, math.tau), rng.uniform()
+        self.gps_bias_m = vector(
+            np.array([*draw_bias_m(share, bearing_rad), rng.uniform(-1.5, 1.5)])
         )
         self._errors = errors
         self._walk_m = self._velocity_error_m_s = ZERO
@@ -230,12 +230,11 @@ class Px4Vehicle:
         self._velocity_m_s = self.acceleration_m_s2 = ZERO
         self.heading_rad, self.yaw_rate_rad_s = heading_rad, 0.0
 
-        self.wind_m_s, self.gust_m_s = np.zeros(3), 0.0
-        self._gust_m_s = self._air_m_s = self._compensated_wind_m_s = ZERO
+        self.wind_m_s = self._gust_m_s = self._air_m_s = self._compensated_wind_m_s = ZERO
         self.battery_remaining, self._battery_warning = 1.0, 1
 
         self.gps_lost = self.estimate_frozen = False
-        self.gps_jump_m = self.gps_offset_m = self.gps_drift_m_s = np.zeros(3)
+        self.gps_jump_m = self.gps_offset_m = self.gps_drift_m_s = ZERO
         self.gps_told_m: float | None = None
         self.receiver = Receiver()
         self._frozen: tuple[Vector, Vector] | None = None
@@ -243,12 +242,13 @@ class Px4Vehicle:
         self._dead_since_s: dict[SimulatedSensor, float] = {}
         self.estimator = Estimator(
             drawn_ready_s if ready_after_s is None else ready_after_s,
-            vector(self._rng.standard_normal(3) * NOISE_M),
+            vector(rng.standard_normal(3) * NOISE_M),
         )
-        self._vertical_drift_m_s = 0.0
-        self.estimator_origin_m: F64 = self.estimated_position_m + self._rng.normal(
-            0.0, (1.0, 1.0, 0.5)
+        self._vertical_drift_m_s = self.gust_m_s = 0.0
+        self.estimator_origin_m = vector(
+            self.estimated_position_m + rng.normal(0.0, (1.0, 1.0, 0.5))
         )
+        self._draws = Draws(rng)
 
         self.armed = self._took_off = False
         self.mode = self.intended_mode = self._mode_after_disarm = Px4Mode.HOLD
@@ -346,11 +346,11 @@ class Px4Vehicle:
             noise_m = plus(noise_m, self._errors.fix_m(self.time_s))
         late_m = minus(self._position_m, times(self._velocity_m_s, GPS_LAG_S))
         honest_m = plus(late_m, self._shared_error_m())
-        return total(honest_m, self.gps_jump_m.tolist(), noise_m)
+        return total(honest_m, self.gps_jump_m, noise_m)
 
     def _shared_error_m(self) -> Vector:
         """Error that fix and estimate have in common."""
-        return total(self.gps_bias_m.tolist(), self._walk_m, self.gps_offset_m.tolist())
+        return total(self.gps_bias_m, self._walk_m, self.gps_offset_m)
 
     @property
     def gps_accuracy_m(self) -> tuple[float, float, float]:
@@ -553,7 +553,7 @@ class Px4Vehicle:
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
         """The estimator starts over from another origin: local positions jump, global ones stay."""
-        self.estimator_origin_m = self.estimator_origin_m + np.array([north_m, east_m, down_m])
+        self.estimator_origin_m = plus(self.estimator_origin_m, (north_m, east_m, down_m))
 
     # Time
 
@@ -567,13 +567,13 @@ class Px4Vehicle:
         if self.dead_sensors or self._dead_since_s:
             self._watch_sensors()
         self._estimate(dt_s)
-        if any(self.gps_drift_m_s.tolist()):
-            self.gps_offset_m = self.gps_offset_m + self.gps_drift_m_s * dt_s
-        self._air_m_s = plus(self.wind_m_s.tolist(), self._gust_m_s)
+        if self.gps_drift_m_s != ZERO:
+            self.gps_offset_m = plus(self.gps_offset_m, times(self.gps_drift_m_s, dt_s))
+        self._air_m_s = plus(self.wind_m_s, self._gust_m_s)
         self._velocity_error_m_s = self.estimator.velocity_error_m_s
         if self._errors is not None:
             errs_m = self._errors.position_m(self.time_s, self.gps_bias_m)
-            self._walk_m = minus(errs_m, self.gps_bias_m.tolist())
+            self._walk_m = minus(errs_m, self.gps_bias_m)
             self._compass_rad = self._errors.heading_rad(self.time_s) + self.compass_jump_rad
             self._air_m_s = plus(self._air_m_s, self._errors.wind_m_s(self.time_s))
             lifted = min(-self._position_m[2] / _ERRS_FROM_M, 1.0)
@@ -600,11 +600,11 @@ class Px4Vehicle:
             self._record_truth()
 
     def _estimate(self, dt_s: float) -> None:
-        draws = self._rng.standard_normal(10).tolist()
+        draws = self._draws.take(10)
         has_gps = not self.gps_lost and SimulatedSensor.GPS not in self.dead_sensors
         has_gps = has_gps and bool(self.parameters["EKF2_GPS_CTRL"])
-        self.receiver.step(dt_s, self._honest_fix_m, self._rng)
-        off_m, off_m_s = vector(self.gps_jump_m), ZERO
+        self.receiver.step(dt_s, self._honest_fix_m, self._draws)
+        off_m, off_m_s = self.gps_jump_m, ZERO
         if self.receiver.lies:
             told_m = plus(self._position_m, self._shared_error_m())
             off_m = plus(off_m, self.receiver.off_m(told_m))
@@ -613,7 +613,7 @@ class Px4Vehicle:
         decay = dt_s / VERTICAL_DRIFT_TIME_S
         grows_m_s = VERTICAL_DRIFT_M_S * draws[6] * math.sqrt(2.0 * decay)
         self._vertical_drift_m_s += -self._vertical_drift_m_s * decay + grows_m_s
-        if self.gust_m_s or any(self._gust_m_s):
+        if self.gust_m_s or self._gust_m_s != ZERO:
             decay = dt_s / WIND_COMPENSATION_S
             pushes_m_s = times(times(draws[7:10], self.gust_m_s), math.sqrt(2.0 * decay))
             self._gust_m_s = plus(times(self._gust_m_s, 1.0 - decay), pushes_m_s)
@@ -963,9 +963,9 @@ class Px4Vehicle:
     def _follow(self, setpoint: Px4Setpoint) -> tuple[Vector, float, float]:
         parameters = self.parameters
         gain, gain_down = parameters["MPC_XY_P"], parameters["MPC_Z_P"]
-        here_m = minus(self.estimate_m(), self.estimator_origin_m.tolist())
-        off_north, off_east, off_down = minus(setpoint.position_m.tolist(), here_m)
-        to_north, to_east, to_down = setpoint.velocity_m_s.tolist()
+        here_m = minus(self.estimate_m(), self.estimator_origin_m)
+        off_north, off_east, off_down = minus(setpoint.position_m, here_m)
+        to_north, to_east, to_down = setpoint.velocity_m_s
         north, east = _shorten(
             _axis(to_north, off_north, gain, 0.0),
             _axis(to_east, off_east, gain, 0.0),
@@ -1077,7 +1077,7 @@ class Px4Vehicle:
             return None
         if not math.isnan(self._setpoint.position_m[0]):
             return "position"
-        return "velocity" if any(self._setpoint.velocity_m_s[:2].tolist()) else "stop"
+        return "velocity" if any(self._setpoint.velocity_m_s[:2]) else "stop"
 
 
 def _axis(velocity_m_s: float, error_m: float, gain: float, drift_m_s: float) -> float:

@@ -387,8 +387,8 @@ def test_each_setpoint_is_sent_once_and_only_if_it_is_finite() -> None:
         heard_s = vehicle.time_s
         assert server.wait_for(lambda: vehicle.time_s > heard_s + 0.5, 60.0)
     (_, velocity), (_, place) = heard
-    assert velocity.velocity_m_s.tolist() == [1.0, 0.0, 0.0]
-    assert place.position_m.tolist() == [4.0, -5.0, -6.5]
+    assert velocity.velocity_m_s == (1.0, 0.0, 0.0)
+    assert place.position_m == (4.0, -5.0, -6.5)
     for unused in (velocity.position_m, place.velocity_m_s, velocity.yaw_rad, place.yaw_rad):
         assert np.isnan(unused).all()
 

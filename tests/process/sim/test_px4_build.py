@@ -54,7 +54,7 @@ assert Path.cwd().name == str(i)
 world = WorldOrigin()
 start_m = world.to_world(float(os.environ["PX4_HOME_LAT"]), float(os.environ["PX4_HOME_LON"]))
 vehicle = Px4Vehicle(seed=i, start_m=start_m, origin=world)
-vehicle.gps_bias_m = vehicle.gps_bias_m * 0.0
+vehicle.gps_bias_m = (0.0, 0.0, 0.0)
 stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda *_: stop.set())
 to_display = mavlink.MAVLink(None, srcSystem=i + 1)

@@ -74,7 +74,7 @@ MODES = {
     Px4Mode.POSCTL: Mode.POSITION,
     Px4Mode.TAKEOFF: Mode.TAKEOFF,
 }
-NOT_SET = np.full(3, np.nan)
+NOT_SET = (math.nan,) * 3
 WORLD = rasterize(random_features(np.random.default_rng(0), 10, 512), 512)
 
 
@@ -111,7 +111,7 @@ class DirectAutopilot:
         )
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
-        commanded = np.array(setpoint[0])
+        commanded = setpoint[0]
         is_velocity = isinstance(setpoint, Velocity)
         self.vehicle.offboard(
             Px4Setpoint(
@@ -375,7 +375,7 @@ def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
         flown.say(safety_action="return")
         flown.until(state)
     before_m = -flown.vehicle.position_m[2]
-    flown.vehicle.gps_bias_m = np.array(jump_m)
+    flown.vehicle.gps_bias_m = jump_m
     qualities = []
     for _ in range(100 if state is not FlightState.RETURN else 30):
         flown.tick()

@@ -7,7 +7,6 @@ time.
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 
 from edge.core.position import PositionCause, PositionQuality
@@ -56,7 +55,7 @@ def lies(**fields: Any) -> Callable[[Px4Vehicle], None]:
 
 
 def jumps(north_m: float) -> Callable[[Px4Vehicle], None]:
-    return sets(gps_jump_m=np.array([north_m, 0.0, 0.0]))
+    return sets(gps_jump_m=(north_m, 0.0, 0.0))
 
 
 # What is done, why the position is doubted, and after how many seconds: told, and 0.4 s. Then when
@@ -75,10 +74,10 @@ LASTING = [
     pytest.param(jumps(7.0), PositionCause.DISAGREES, 0.8, 2.5, id="jumps"),
     pytest.param(lies(stuck=True), PositionCause.GPS_STUCK, 1.2, 2.8, id="stuck"),
     pytest.param(
-        lies(creep_m_s=np.array([2.0, 0.0, 0.0])), PositionCause.SLIPS, 3.5, 5.5, id="creeps"
+        lies(creep_m_s=(2.0, 0.0, 0.0)), PositionCause.SLIPS, 3.5, 5.5, id="creeps"
     ),
     pytest.param(
-        lies(velocity_bias_m_s=np.array([0.0, 3.0, 0.0])), PositionCause.VELOCITY_DISAGREES, 0.8,
+        lies(velocity_bias_m_s=(0.0, 3.0, 0.0)), PositionCause.VELOCITY_DISAGREES, 0.8,
         # In between the estimate follows it.
         4.3,
         id="wrong velocity",
@@ -112,7 +111,7 @@ def test_a_jump_is_rejected_for_a_while_and_then_believed() -> None:
     watched = flying()
     vehicle = watched.vehicle
     error_m = vehicle.estimated_position_m - vehicle.position_m
-    vehicle.gps_jump_m = np.array([7.0, 0.0, 0.0])
+    vehicle.gps_jump_m = (7.0, 0.0, 0.0)
     causes = set()
     for _ in range(round((GPS_REJECTED_S - 0.5) / TICK_S)):
         watched.tick()
@@ -133,7 +132,7 @@ def test_a_jump_that_is_near_enough_to_be_true_is_followed_smoothly() -> None:
     watched = flying()
     vehicle = watched.vehicle
     error_m = vehicle.estimated_position_m - vehicle.position_m
-    vehicle.gps_jump_m = np.array([0.0, -3.0, 0.0])
+    vehicle.gps_jump_m = (0.0, -3.0, 0.0)
     assert run(watched, 12.0) == []
     moved_m = vehicle.estimated_position_m - vehicle.position_m - error_m
     assert moved_m == pytest.approx([0.0, -3.0, 0.0], abs=0.7)

@@ -14,12 +14,13 @@ from lpac.sim.px4 import checks
 from lpac.sim.px4.checks import Component
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import MavResult, Px4Mode
+from lpac.sim.px4.vector import vector
 from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle, SimulatedSensor
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
 STEP_S = 0.02
 DENIED = "Arming denied: Resolve system health failures first"
-NAN_3 = np.full(3, math.nan)
+NAN_3 = (math.nan,) * 3
 
 
 def run(vehicle: Px4Vehicle, duration_s: float, setpoint: Px4Setpoint | None = None) -> None:
@@ -52,7 +53,7 @@ def hovering(seed: int = 1, altitude_m: float = 5.0, *, rc: bool = False) -> Px4
 
 
 def velocity(north: float, east: float = 0.0, down: float = 0.0) -> Px4Setpoint:
-    return Px4Setpoint(NAN_3, np.array([north, east, down]))
+    return Px4Setpoint(NAN_3, (north, east, down))
 
 
 def in_offboard(setpoint: Px4Setpoint, *, rc: bool = False, **parameters: int) -> Px4Vehicle:
@@ -182,7 +183,7 @@ def test_a_velocity_setpoint_lags_and_lets_the_height_drift() -> None:
 def test_an_offboard_position_is_one_of_the_local_frame() -> None:
     vehicle = hovering()
     target_m = vehicle.local_position_m + np.array([2.0, -3.0, -1.0])
-    setpoint = Px4Setpoint(target_m, NAN_3, yaw_rad=1.0)
+    setpoint = Px4Setpoint(vector(target_m), NAN_3, yaw_rad=1.0)
     vehicle.offboard(setpoint)
     vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 12.0, setpoint)
@@ -344,7 +345,7 @@ def test_without_gps_it_descends_where_the_wind_takes_it() -> None:
     assert mode_of(vehicle) is Px4Mode.HOLD
     run(vehicle, 1.0)
     assert mode_of(vehicle) is Px4Mode.DESCEND
-    vehicle.wind_m_s = np.array([0.0, 1.5, 0.0])
+    vehicle.wind_m_s = (0.0, 1.5, 0.0)
     east_m = vehicle.position_m[1]
     run_until(vehicle, lambda: not vehicle.armed, 30.0)
     assert vehicle.position_m[1] - east_m > 3.0
@@ -464,12 +465,12 @@ def test_the_same_seed_flies_the_same_flight() -> None:
 def test_wind_pushes_at_first_and_a_storm_carries_away() -> None:
     vehicle = hovering()
     before_m = vehicle.position_m
-    vehicle.wind_m_s = np.array([6.0, 0.0, 0.0])
+    vehicle.wind_m_s = (6.0, 0.0, 0.0)
     run(vehicle, 2.0)
     assert 0.1 < vehicle.position_m[0] - before_m[0] < 4.0
     run(vehicle, 30.0)
     assert np.linalg.norm((vehicle.position_m - before_m)[:2]) < 1.0
-    vehicle.wind_m_s = np.array([20.0, 0.0, 0.0])
+    vehicle.wind_m_s = (20.0, 0.0, 0.0)
     run(vehicle, 10.0)
     assert vehicle.position_m[0] - before_m[0] > 30.0
 
@@ -491,7 +492,7 @@ def test_an_origin_jump_moves_local_positions_and_what_follows_them() -> None:
     north_m = vehicle.position_m[0]
     run(vehicle, 3.0)
     assert vehicle.position_m[0] == pytest.approx(north_m, abs=0.5)
-    setpoint = Px4Setpoint(local_m, NAN_3)
+    setpoint = Px4Setpoint(vector(local_m), NAN_3)
     vehicle.offboard(setpoint)
     vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 10.0, setpoint)
@@ -503,7 +504,7 @@ def test_an_origin_that_moves_in_height_lets_the_vehicle_climb_unseen() -> None:
     here_m, height_m = vehicle.local_position_m, -vehicle.position_m[2]
     vehicle.jump_estimator_origin(0.0, 0.0, -6.0)
     assert vehicle.local_position_m - here_m == pytest.approx([0.0, 0.0, 6.0])
-    setpoint = Px4Setpoint(here_m, NAN_3)
+    setpoint = Px4Setpoint(vector(here_m), NAN_3)
     vehicle.offboard(setpoint)
     vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 10.0, setpoint)

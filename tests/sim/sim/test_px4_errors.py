@@ -30,7 +30,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 def horizontal_m(errors: Errors, bias_m: tuple[float, float]) -> np.ndarray:
     """Of a flight: (T, 2)."""
-    bias = np.array([*bias_m, 0.0])
+    bias = (*bias_m, 0.0)
     return np.array([errors.position_m(at_s, bias)[:2] for at_s in FLIGHT_S])
 
 
@@ -137,7 +137,7 @@ def test_gusts_and_a_wrong_compass_move_a_vehicle_that_holds_by_less_than_a_metr
 
 def test_gusts_and_its_estimate_disturb_a_velocity_that_is_followed() -> None:
     vehicle = flying(Errors(2, 2))
-    setpoint = Px4Setpoint(np.full(3, math.nan), np.array([0.5, 0.0, 0.0]))
+    setpoint = Px4Setpoint((math.nan,) * 3, (0.5, 0.0, 0.0))
     vehicle.offboard(setpoint)
     assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.ACCEPTED
     off_m_s = []

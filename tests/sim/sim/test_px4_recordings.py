@@ -23,6 +23,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.vector import plus
 from lpac.sim.px4.vehicle import CHECKS_PERIOD_S, LANDED_AFTER_S, Px4Vehicle, SimulatedSensor
 from tests.px4_recordings import frames
 
@@ -159,7 +160,7 @@ def dies(*sensors: SimulatedSensor) -> Callable[[Px4Vehicle], None]:
 
 def drifts(north_m: float) -> Callable[[Px4Vehicle], None]:
     def do(vehicle: Px4Vehicle) -> None:
-        vehicle.gps_bias_m = vehicle.gps_bias_m + np.array([north_m, 0.0, 0.0])
+        vehicle.gps_bias_m = plus(vehicle.gps_bias_m, (north_m, 0.0, 0.0))
 
     return do
 

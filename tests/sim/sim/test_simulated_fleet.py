@@ -174,7 +174,7 @@ def test_a_fleet_flies_its_mission_and_lands_on_its_pads(tmp_path: Path) -> None
 def test_a_copy_flies_on_as_the_first_does_and_apart_from_it() -> None:
     fleet = in_mission()
     copies = [fleet.copy() for _ in range(3)]
-    copies[0].vehicles[0].vehicle.wind_m_s = np.array([3.0, 0.0, 0.0])
+    copies[0].vehicles[0].vehicle.wind_m_s = (3.0, 0.0, 0.0)
     copies[1].radio.air = dataclasses.replace(copies[1].radio.air, silent=frozenset({0, 1}))
     flown = []
     for each in (*copies, fleet):

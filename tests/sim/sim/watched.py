@@ -15,6 +15,7 @@ from lpac.sim.px4.errors import Errors
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.server import STEP_S
+from lpac.sim.px4.vector import vector
 from lpac.sim.px4.vehicle import Airframe, Px4Setpoint, Px4Vehicle
 
 # One look; and by when the vehicle flies at its height.
@@ -61,7 +62,7 @@ class Watched:
             self._velocity_m_s[:2] = _SPEED_M_S * np.array([math.cos(bearing), math.sin(bearing)])
         height_m = -float(vehicle.local_position_m[2])
         self._velocity_m_s[2] = -min(_HEIGHT_M - height_m, 1.5)
-        vehicle.offboard(Px4Setpoint(np.full(3, np.nan), self._velocity_m_s.copy()))
+        vehicle.offboard(Px4Setpoint((math.nan,) * 3, vector(self._velocity_m_s)))
         if not vehicle.armed and vehicle.armable and now_s > READY_S / 2.0:
             vehicle.set_mode(Px4Mode.OFFBOARD)
             vehicle.arm()

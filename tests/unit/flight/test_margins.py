@@ -190,7 +190,7 @@ def test_simulated_vehicles_land_apart_in_truth() -> None:
         landed_m = []
         for i in range(10):
             errors = Errors(100 * fleet + i, fleet)
-            bias_m = np.array([*draw_bias_m(*rng.uniform((0.0, 0.0), (1.0, math.tau))), 0.0])
+            bias_m = (*draw_bias_m(*rng.uniform((0.0, 0.0), (1.0, math.tau))), 0.0)
             walked_m = np.array(errors.position_m(rng.uniform(60.0, 600.0), bias_m))
             walked_m = walked_m - errors.position_m(0.0, bias_m)
             landed_m.append(np.array([i * apart_m, 0.0]) - walked_m[:2])
