@@ -8,7 +8,7 @@ is late, the vehicle's own time does, of those messages that have it.
 """
 
 import math
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Hashable
 from typing import Literal, NamedTuple
 
@@ -65,6 +65,14 @@ class _Stream:
         self.heard_at_s = -math.inf
 
 
+class _Taken(NamedTuple):
+    """A frame that was taken: when, by which path, and of which stream."""
+
+    at_s: float
+    path: Hashable
+    stream: _Stream | None
+
+
 class _Path:
     """The streams of one path, and the vehicle's time of the newest of each message."""
 
@@ -77,11 +85,12 @@ class _Path:
 
     def nearest(self, number: int, now_s: float) -> _Stream | None:
         """Return the stream that has the fewest numbers left before this one."""
-        oldest_s = -math.inf if now_s - self.heard_at_s <= _SILENT_S else now_s
-        oldest_s = max(oldest_s, now_s - _REMEMBERED_S)
-        self.streams = [s for s in self.streams if s.heard_at_s >= oldest_s]
-        if len(self.streams) == 1:
-            return self.streams[0]
+        oldest_s = now_s - (_REMEMBERED_S if now_s - self.heard_at_s <= _SILENT_S else 0.0)
+        streams = self.streams
+        # Mostly there is this one alone.
+        if len(streams) == 1 and streams[0].heard_at_s >= oldest_s:
+            return streams[0]
+        self.streams = [s for s in streams if s.heard_at_s >= oldest_s]
         return min(self.streams, key=lambda s: (number - s.newest - 1) % _NUMBERS, default=None)
 
     def begin_stream(self, number: int) -> _Stream:
@@ -115,16 +124,14 @@ class VehicleFrames:
         # Of each message that has the vehicle's time.
         self._newest: dict[int, _Newest] = {}
         self._latest_s = -math.inf
-        # Of each content: when it was taken, by which path, and of which stream; oldest first. A
-        # dict that is emptied from its front takes ever longer to find that.
-        self._taken: OrderedDict[Hashable, tuple[float, Hashable, _Stream | None]] = OrderedDict()
+        # Of each content that was taken in the last seconds, or a little longer ago.
+        self._taken: dict[Hashable, _Taken] = {}
         self._seconds: deque[_Second] = deque(maxlen=_LOSS_S + 1)
         # When a frame was last found to be lost, and last came again.
         self._lost_at_s = self._again_at_s = -math.inf
 
     def take(self, frame: Frame, now_s: float) -> bool:
         """Whether it is to be taken: it is neither old nor was taken before."""
-        self._forget(now_s)
         newest = None if frame.vehicle_s is None else self._newest.get(frame.message_id)
         if newest is not None and self._began_anew(frame, newest, now_s):
             self._newest.clear()
@@ -155,9 +162,7 @@ class VehicleFrames:
         if is_old or sort != "next":
             return False
         second.taken += 1
-        if frame.content in self._taken:
-            self._taken.move_to_end(frame.content)
-        self._taken[frame.content] = now_s, frame.path, stream
+        self._taken[frame.content] = _Taken(now_s, frame.path, stream)
         if frame.vehicle_s is not None:
             second.timed += 1
             self._newest[frame.message_id] = _Newest(frame.vehicle_s, now_s, frame.path)
@@ -193,9 +198,9 @@ class VehicleFrames:
         least = max(_LEAST_OTHERS, _OTHERS_SHARE * sum(s.timed for s in seconds))
         return others >= least and others > sum(s.again for s in seconds)
 
-    def _forget(self, now_s: float) -> None:
-        while self._taken and now_s - next(iter(self._taken.values()))[0] > _REMEMBERED_S:
-            self._taken.popitem(last=False)
+    def _taken_lately(self, frame: Frame, now_s: float) -> _Taken | None:
+        taken = self._taken.get(frame.content)
+        return None if taken is None or now_s - taken.at_s > _REMEMBERED_S else taken
 
     def _forget_paths(self, now_s: float) -> None:
         """Anybody can make one more."""
@@ -207,7 +212,7 @@ class VehicleFrames:
         """Whether the vehicle was switched on anew, or another one is there instead."""
         if frame.vehicle_s is None or frame.vehicle_s >= newest.vehicle_s:
             return False
-        if frame.content in self._taken:
+        if self._taken_lately(frame, now_s) is not None:
             return False
         silent_s = now_s - newest.at_s
         # What was sent before the silence is only late.
@@ -220,12 +225,12 @@ class VehicleFrames:
 
     def _sort(self, frame: Frame, path: _Path, now_s: float) -> tuple[_Sort, _Stream | None]:
         """Classify a frame against its path's and those that were taken, and find its stream."""
-        taken = self._taken.get(frame.content)
-        by_other = taken is not None and taken[1] != frame.path
+        taken = self._taken_lately(frame, now_s)
+        by_other = taken is not None and taken.path != frame.path
         stream = path.nearest(frame.number, now_s)
         ahead = 0 if stream is None else (frame.number - stream.newest) % _NUMBERS
         # Once its numbers have come round, a stream may say the same with the same number.
-        came_round = stream is None or (ahead == 1 and taken is not None and taken[2] is stream)
+        came_round = stream is None or (ahead == 1 and taken is not None and taken.stream is stream)
         if taken is not None and not by_other and not came_round:
             return "again", stream
         follows = 0 < ahead <= _MOST_LOST
@@ -267,6 +272,11 @@ class VehicleFrames:
         second = math.floor(now_s)
         if not self._seconds or self._seconds[-1].second != second:
             self._seconds.append(_Second(second))
+            self._taken = {
+                content: taken
+                for content, taken in self._taken.items()
+                if now_s - taken.at_s <= _REMEMBERED_S
+            }
         return self._seconds[-1]
 
     def _within(self, seconds: int, now_s: float) -> list[_Second]:
