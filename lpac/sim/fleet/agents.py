@@ -48,9 +48,8 @@ class DeferredAgent(LpacAgent):
 
     def observe(self, observation: Observation) -> Perceived:
         """Keep the observation, and give no features."""
-        position, local_map, neighbours, velocity = observation
-        # The map's array is used again.
-        self._seen = Observation(position, local_map.copy(), neighbours, velocity)
+        # Its map is valid until the next one's.
+        self._seen = observation
         return Perceived(np.zeros(0, np.float32), {})
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:

@@ -67,7 +67,6 @@ class SimulatedRobot:
         open_link: Callable[["SimulatedRobot", Subscriptions], OpenLink],
         new_guard: Callable[["SimulatedRobot", int], Guard],
         next_boot: Callable[[], int],
-        vehicle_step_s: float,
         logs: bool,
     ) -> None:
         """`world` is the text of its world file. `next_boot` numbers the starts of programs."""
@@ -90,7 +89,6 @@ class SimulatedRobot:
         self._link: OpenLink | None = None
         self._logs = logs
         self._log: FlightLog | None = None
-        schedule.every(vehicle_step_s, partial(vehicle.step, vehicle_step_s), vehicle_step_s)
 
     @property
     def status(self) -> RobotStatus | None:
@@ -247,12 +245,14 @@ class SimulatedRobots:
             for i, vehicle in enumerate(self.vehicles)
         )
         self.all_programs = list(self.robots)
+        self._let_fly(self.vehicles)
 
     def second_program(self, robot_id: int, vehicle: DirectVehicle) -> SimulatedRobot:
         """Another computer that says that it is this robot, with a vehicle of its own."""
         first = self.robots[robot_id]
         second = self._robot(first.config, vehicle, first.world)
         self.all_programs.append(second)
+        self._let_fly([vehicle])
         return second
 
     def true_positions_m(self) -> F64:
@@ -268,6 +268,10 @@ class SimulatedRobots:
             robot.stop()
         self._sensors.close()
 
+    def _let_fly(self, vehicles: Sequence[DirectVehicle]) -> None:
+        step_s = self._vehicle_step_s
+        self.schedule.every(step_s, partial(_step, vehicles, step_s), step_s)
+
     def _robot(self, config: RobotConfig, vehicle: DirectVehicle, world: str) -> SimulatedRobot:
         sensor = open_sensor(config.sensor.type, config.sensor.options, self.layout.bundle.manifest)
         return SimulatedRobot(
@@ -281,7 +285,6 @@ class SimulatedRobots:
             self._open_link,
             self._new_guard,
             self._next_boot,
-            self._vehicle_step_s,
             self._logs,
         )
 
@@ -306,6 +309,11 @@ class SimulatedRobots:
     def _next_boot(self) -> int:
         self._boots += 1
         return self._boots
+
+
+def _step(vehicles: Sequence[DirectVehicle], dt_s: float) -> None:
+    for vehicle in vehicles:
+        vehicle.step(dt_s)
 
 
 class SimulatedWatchdog:

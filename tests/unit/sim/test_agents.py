@@ -22,7 +22,6 @@ def test_who_looks_late_decides_as_who_looks_at_once(shipped_policy: LpacPolicy)
             position, neighbours = size * rng.random(2), size * rng.random((2, 2))
             observation = Observation(position, local_map, neighbours, np.zeros(2))
             seen, unseen = agent.observe(observation), deferred.observe(observation)
-        local_map[:] = np.nan
         payloads = [rng.random(shipped_policy.message_size).astype(np.float32)]
         for _ in range(2):
             step = agent.step(seen.features, payloads, 1)
