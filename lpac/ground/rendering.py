@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 from edge.core.counted import counted
 from edge.core.fence import Fence
 from edge.messages.codes import texts
-from edge.messages.mission import ON_GROUND, FlightState, RobotStatus
+from edge.messages.mission import ON_GROUND, FlightState, GroundState, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
 from lpac.ground.alarms import (
     BATTERY_LOW,
@@ -244,7 +244,7 @@ def _satellites(_: Row, status: RobotStatus) -> Span:
     return Span(number(status.satellites, 3, 0), "warning" if few else "")
 
 
-def _coordinate(axis: int, width: int) -> "_Cell":
+def _coordinate(axis: int, width: int) -> "_CellOf":
     def of_status(_: Row, status: RobotStatus) -> Span:
         return Span(number(status.position_m[axis] if status.position_m else None, width))
 
@@ -287,7 +287,7 @@ def _margin(row: Row, status: RobotStatus) -> Span:
 
 # Of a robot, whether it was heard or not; of what it said.
 _RobotCell = Callable[[Row], Span]
-_Cell = Callable[[Row, RobotStatus], Span]
+_CellOf = Callable[[Row, RobotStatus], Span]
 
 
 class Column(NamedTuple):
@@ -298,7 +298,7 @@ class Column(NamedTuple):
     top: str
     unit: str
     width: int
-    of: _Cell | None
+    of: _CellOf | None
     left: bool = False
 
 
@@ -334,20 +334,20 @@ COLUMN = {column.key: column for column in COLUMNS}
 
 def cell(row: Row, column: str) -> Span:
     """One of a row's cells. What was said long ago is faint."""
-    text, style = _told(row, column)
+    text, style = _cell(row, column)
     old = column not in _OF_ROBOT and not row.robot.fresh
     return Span(text, "faint" if old else style)
 
 
 def quantity(row: Row, column: str) -> Span:
     """A cell with its unit, where no heading has it, however old it is. Counts have none."""
-    text, style = _told(row, column)
+    text, style = _cell(row, column)
     text, unit = text.strip(), COLUMN[column].unit
     counts = unit in ("", "n", "sat")
     return Span(text if counts or not text[-1:].isdigit() else f"{text} {unit}", style)
 
 
-def _told(row: Row, column: str) -> Span:
+def _cell(row: Row, column: str) -> Span:
     if column in _OF_ROBOT:
         return _OF_ROBOT[column](row)
     status, of = row.robot.status, COLUMN[column].of
@@ -376,120 +376,87 @@ def facts(row: Row, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) -> list[Fa
     told += [Fact("not taken", each.text, "warning") for each in status.not_taken]
     if status.state in ON_GROUND:
         told += [Fact("not ready", check.text) for check in status.failed_checks]
-    more = {
-        "vehicle": _vehicle(status),
-        "GPS": _gps(status),
-        "position": _position(status),
-        "landing": _landing(row, status),
-        "policy": _policy(status),
-        "obeys": _obeys(status, snapshot),
-        "orders": "; ".join(
-            "accepted" if order.refusal is None else f"refused: {order.refusal.text}"
-            for order in reversed(status.orders)
-        ),
-        "release": _release(status),
-        "origin": _origin(status),
-        "program": _program(robot, status),
-    }
+    more = _flight(status) | _program(row, status, snapshot.ground)
     return told + [Fact(name, text) for name, text in more.items() if text]
 
 
-def _vehicle(status: RobotStatus) -> str:
+def _flight(status: RobotStatus) -> dict[str, str]:
     armed = {True: "armed", False: "disarmed", None: "armed or not: unknown"}
     air = {True: "in the air", False: "on the ground", None: ""}
-    return _listed(
-        status.mode or "mode unknown",
-        armed[status.armed],
-        air[status.in_air],
-        "" if status.battery is None else f"battery {status.battery:.0%}",
-        _lasts(status),
-        "" if status.system_id is None else f"system id {status.system_id}",
-    )
-
-
-def _lasts(status: RobotStatus) -> str:
-    if status.battery_lasts_s is None:
-        return ""
-    home = "" if status.home_s is None else f" of which home takes {status.home_s:.0f}"
-    return f"for {status.battery_lasts_s:.0f} s{home}"
-
-
-def _gps(status: RobotStatus) -> str:
-    return _listed(
-        "" if status.satellites is None else counted(status.satellites, "satellite"),
-        "" if status.hdop is None else f"HDOP {status.hdop:.1f}",
-        "" if status.gps_accuracy_m is None else f"accurate to {status.gps_accuracy_m:.1f} m",
-        "" if status.global_deg is None else "at {:.6f} {:.6f}".format(*status.global_deg),
-    )
-
-
-def _position(status: RobotStatus) -> str:
     where = f"height {status.slot_height_m:g} m when it flies"
     if status.position_m is not None:
         x_m, y_m, height_m = status.position_m
         where = f"x {x_m:.1f}, y {y_m:.1f}, height {height_m:.1f} of {status.slot_height_m:g} m"
+    lasts = _told("for {:.0f} s", status.battery_lasts_s)
     heading_rad = status.heading_rad
-    return _listed(
-        where,
-        "" if status.position_quality is None else f"position {status.position_quality}",
-        "" if status.velocity_m_s is None else f"{speed_m_s(status):.1f} m/s",
-        "" if heading_rad is None else f"heading {direction(math.degrees(heading_rad))}",
-    )
+    return {
+        "vehicle": _listed(
+            status.mode or "mode unknown",
+            armed[status.armed],
+            air[status.in_air],
+            _told("battery {:.0%}", status.battery),
+            lasts and lasts + _told(" of which home takes {:.0f}", status.home_s),
+            _told("system id {}", status.system_id),
+        ),
+        "GPS": _listed(
+            "" if status.satellites is None else counted(status.satellites, "satellite"),
+            _told("HDOP {:.1f}", status.hdop),
+            _told("accurate to {:.1f} m", status.gps_accuracy_m),
+            _told("at {0[0]:.6f} {0[1]:.6f}", status.global_deg),
+        ),
+        "position": _listed(
+            where,
+            _told("position {}", status.position_quality),
+            _told("{:.1f} m/s", speed_m_s(status)),
+            "" if heading_rad is None else f"heading {direction(math.degrees(heading_rad))}",
+        ),
+    }
 
 
-def _listed(*parts: str) -> str:
+def _program(row: Row, status: RobotStatus, ground: GroundState | None) -> dict[str, str]:
+    x_m, y_m = landing_m = status.landing_point_m
+    position_m, origin = status.position_m, status.origin
+    away_m = None if position_m is None else math.dist(position_m[:2], landing_m)
+    safety_action = "none" if ground is None else ground.safety_action_for(status.robot_id)
+    return {
+        "landing": f"at x {x_m:.1f} m, y {y_m:.1f} m"
+        + _told(", {:.1f} m away", away_m)
+        + _told("; fence margin {:.1f} m", _fence_margin_m(row, status)),
+        "policy": _listed(
+            _told("asks for {0[0]:.2f} {0[1]:.2f} m/s", status.policy_velocity_m_s) or "no answer",
+            _told("features {:.1f} s old", status.feature_age_s) or "no features",
+            status.trial and f"trial {status.trial}",
+        ),
+        "obeys": f"{status.operator}, state {status.obeyed_sequence}"
+        + ("" if ground is None else f" of {ground.sequence}")
+        + ("" if safety_action == "none" else f", asked to {safety_action}")
+        if status.operator
+        else "nobody yet",
+        "orders": "; ".join(
+            "accepted" if order.refusal is None else f"refused: {order.refusal.text}"
+            for order in reversed(status.orders)
+        ),
+        "release": _listed(
+            f"bundle {status.bundle_id[:ID]}",
+            f"world {status.world_id[:ID]}",
+            _told("fence {}", status.fence and fence_size(status.fence)),
+        ),
+        "origin": ""
+        if origin is None
+        else f"{origin.latitude_deg:.7f} {origin.longitude_deg:.7f} "
+        f"{direction(origin.heading_deg, 1)}",
+        "program": f"up {duration(status.uptime_s)}, start {status.boot_nonce:x}"
+        + _told(", clock {:+.2f} s", row.robot.clock_offset_s),
+    }
+
+
+def _told(text: str, value: object) -> str:
+    """The text with that value, if it is known."""
+    return "" if value is None else text.format(value)
+
+
+def _listed(*parts: str | None) -> str:
     return ", ".join(part for part in parts if part)
-
-
-def _policy(status: RobotStatus) -> str:
-    velocity_m_s, age_s = status.policy_velocity_m_s, status.feature_age_s
-    return _listed(
-        "no answer" if velocity_m_s is None else "asks for {:.2f} {:.2f} m/s".format(*velocity_m_s),
-        "no features" if age_s is None else f"features {age_s:.1f} s old",
-        f"trial {status.trial}" if status.trial else "",
-    )
-
-
-def _landing(row: Row, status: RobotStatus) -> str:
-    x_m, y_m = status.landing_point_m
-    text = f"at x {x_m:.1f} m, y {y_m:.1f} m"
-    if status.position_m is not None:
-        away_m = math.dist(status.position_m[:2], status.landing_point_m)
-        text += f", {away_m:.1f} m away"
-    margin_m = _fence_margin_m(row, status)
-    return text if margin_m is None else f"{text}; fence margin {margin_m:.1f} m"
-
-
-def _obeys(status: RobotStatus, snapshot: FleetSnapshot) -> str:
-    if not status.operator:
-        return "nobody yet"
-    ground = snapshot.ground
-    said = "" if ground is None else f" of {ground.sequence}"
-    safety_action = "" if ground is None else ground.safety_action_for(status.robot_id)
-    asked = f", asked to {safety_action}" if safety_action not in ("", "none") else ""
-    return f"{status.operator}, state {status.obeyed_sequence}{said}{asked}"
-
-
-def _release(status: RobotStatus) -> str:
-    return _listed(
-        f"bundle {status.bundle_id[:ID]}",
-        f"world {status.world_id[:ID]}",
-        "" if status.fence is None else f"fence {fence_size(status.fence)}",
-    )
-
-
-def _origin(status: RobotStatus) -> str:
-    origin = status.origin
-    if origin is None:
-        return ""
-    where = f"{origin.latitude_deg:.7f} {origin.longitude_deg:.7f}"
-    return f"{where} {direction(origin.heading_deg, 1)}"
-
-
-def _program(robot: RobotSnapshot, status: RobotStatus) -> str:
-    offset_s = robot.clock_offset_s
-    clock = "" if offset_s is None else f", clock {offset_s:+.2f} s"
-    return f"up {duration(status.uptime_s)}, start {status.boot_nonce:x}{clock}"
 
 
 class StatusTable(NamedTuple):

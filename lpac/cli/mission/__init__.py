@@ -1,10 +1,9 @@
 """`lpac mission`: command the fleet."""
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -27,7 +26,6 @@ from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet
 if TYPE_CHECKING:
     from edge.messages.mission import Origin
     from lpac.ground.site import Point, Standing
-    from lpac.ground.station.protocol import Request
 
 app = new_app(
     "mission", "Command the fleet, through `lpac ground`. Done when every robot has answered."
@@ -300,30 +298,21 @@ def assign(
 # Flying
 
 
-def _add(
-    name: str, about: str, request: Callable[[Any, tuple[str, ...]], "Request"],
-    options: type[Named] = Named,
-) -> None:  # fmt: skip
-    """Add a command that asks for one thing; `request` makes it with the module of requests."""
+def _add(name: str, about: str, options: type[Named] = Named) -> None:
+    """Add a command for robots that asks for one thing."""
 
     @options_of(options)
     def command(of: Named) -> None:
-        from lpac.ground.station import protocol
+        from lpac.ground.station.protocol import of_robots
 
         to = _named(of, name)
-        ask(to, request(protocol, to.robots), name, as_json=of.as_json)
+        ask(to, of_robots(name, to.robots), name, as_json=of.as_json)
 
     app.command(name, help=about)(command)
 
 
-_add(
-    "enable", "Let the robots run their checks, and fly.",
-    lambda of, robots: of.Enable(True, robots),
-)  # fmt: skip
-_add(
-    "disable", "Let the robots fly no more: those in the air hold.",
-    lambda of, robots: of.Enable(False, robots),
-)  # fmt: skip
+_add("enable", "Let the robots run their checks, and fly.")
+_add("disable", "Let the robots fly no more: those in the air hold.")
 
 
 @app.command()
@@ -355,15 +344,9 @@ def takeoff(
     ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=of.as_json)
 
 
-_add("start", "Fly the mission, from hold.", lambda of, robots: of.Start(robots))
-_add(
-    "hold", "Stay where they are. Anybody may command it.",
-    lambda of, robots: of.SafetyCommand("hold", robots),
-)  # fmt: skip
-_add(
-    "resume", "Withdraw hold, return or land; robots that flew the mission fly it again.",
-    lambda of, robots: of.Resume(robots),
-)  # fmt: skip
+_add("start", "Fly the mission, from hold.")
+_add("hold", "Stay where they are. Anybody may command it.")
+_add("resume", "Withdraw hold, return or land; robots that flew the mission fly it again.")
 
 
 @app.command()
@@ -393,12 +376,9 @@ def _bring_down(safety_action: Literal["return", "land"], of: Named, *, wait: bo
 
 _add(
     "pilot", "Hand robots to human pilots, by name: the program commands nothing until `rejoin`.",
-    lambda of, robots: of.RobotCommand("pilot", robots), OnlyNamed,
+    OnlyNamed,
 )  # fmt: skip
-_add(
-    "rejoin", "Take robots back from their pilots, by name: they hold; then `start`.",
-    lambda of, robots: of.RobotCommand("rejoin", robots), OnlyNamed,
-)  # fmt: skip
+_add("rejoin", "Take robots back from their pilots, by name: they hold; then `start`.", OnlyNamed)
 
 
 @app.command()

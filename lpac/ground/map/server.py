@@ -34,18 +34,7 @@ from lpac.ground.map.view import (
 )
 from lpac.ground.rendering import rows
 from lpac.ground.station.client import listen, send
-from lpac.ground.station.protocol import (
-    CommandReport,
-    Enable,
-    Problem,
-    ProblemCode,
-    Request,
-    Resume,
-    SafetyCommand,
-    Start,
-    TakeCommand,
-    Takeoff,
-)
+from lpac.ground.station.protocol import CommandReport, Problem, ProblemCode, of_robots
 
 _PAGE = Path(__file__).parent / "page"
 _FILES = {
@@ -76,16 +65,7 @@ _MAX_EVENTS = 200
 _MAX_REQUEST_BYTES = 4096
 
 # All that a page can ask of the fleet. Kill is not among it: `lpac mission kill` asks.
-_ACTIONS: dict[str, Callable[[tuple[str, ...]], Request]] = {
-    "enable": lambda robots: Enable(robots=robots),
-    "takeoff": lambda robots: Takeoff(robots=robots),
-    "start": lambda robots: Start(robots=robots),
-    "hold": lambda robots: SafetyCommand("hold", robots=robots),
-    "resume": lambda robots: Resume(robots=robots),
-    "return": lambda robots: SafetyCommand("return", robots=robots),
-    "land": lambda robots: SafetyCommand("land", robots=robots),
-    "command": lambda _: TakeCommand(),
-}
+_ACTIONS = ("enable", "takeoff", "start", "hold", "resume", "return", "land", "command")
 
 
 class Outbox:
@@ -380,7 +360,7 @@ class LiveMap:
             report = CommandReport(problem=Problem(ProblemCode.NOT_UNDERSTOOD, text))
         else:
             try:
-                report = await send(self._fleet, _ACTIONS[action](robots))
+                report = await send(self._fleet, of_robots(action, robots))
             except (OSError, ValueError) as error:
                 report = CommandReport(problem=Problem(ProblemCode.NO_GROUND, str(error)))
         page.put_each(_text(report_view(action, report)))

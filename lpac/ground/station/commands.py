@@ -18,6 +18,7 @@ from edge.messages.mission import (
     world_id,
 )
 from lpac.analysis.snapshot import COMMANDER_SILENT_S
+from lpac.ground.rendering import NOT_HEARD, missing_checks, state_and_reason
 from lpac.ground.station.protocol import (
     CommandProgress,
     CommandReport,
@@ -38,6 +39,8 @@ from lpac.ground.station.protocol import (
     Start,
     TakeCommand,
     Takeoff,
+    command_name,
+    in_words,
 )
 from lpac.ground.station.station import Station, is_down
 from lpac.ground.station.wishes import next_trial
@@ -62,7 +65,7 @@ _LANDING_S = 120.0
 
 _S, _C = FlightState, ResultCode
 
-_NOT_HEARD = _C.NOT_HEARD, "not heard"
+_NOT_HEARD = _C.NOT_HEARD, NOT_HEARD
 _NOT_ENABLED = "not enabled: `lpac mission enable`"
 
 Waits = Generator[None, None, None]
@@ -87,6 +90,7 @@ class CommandTask:
         """`on_taken` is called once the command is known to be possible, before it does a thing."""
         self.request = request
         self.text = in_words(request)
+        self.name = command_name(request)
         self.names = _addressed(station, request)
         self.report: CommandReport | None = None
         self._station = station
@@ -136,8 +140,7 @@ class CommandTask:
             if name not in robots:
                 text = f"robot {name!r} is unknown; known are {', '.join(robots)}"
                 raise _ProblemError(ProblemCode.UNKNOWN_ROBOT, text)
-        urgent = _is_everybodys(self.request) and not isinstance(self.request, TakeCommand)
-        while not station.election.listened or not (urgent or self._are_gathered()):
+        while not station.election.listened or not (self.name in _URGENT or self._are_gathered()):
             yield
         # Who sits in a slot is known only now.
         self.names = _addressed(station, self.request)
@@ -165,7 +168,7 @@ class CommandTask:
         """Raises _ProblemError if this station's operator may not ask for it."""
         station = self._station
         commander = station.election.commander
-        if not station.election.may_command and not _is_hold(self.request):
+        if not station.election.may_command and self.name != "hold":
             text = f"{station.operator} is an observer of this fleet: it may ask for hold alone"
             raise _ProblemError(ProblemCode.MAY_NOT, text)
         if station.card_problem is not None and isinstance(self.request, (Takeoff, Start)):
@@ -175,7 +178,7 @@ class CommandTask:
             )
             raise _ProblemError(ProblemCode.MAY_NOT, text)
         own = station.commands or commander in ("", station.operator)
-        if own or _is_everybodys(self.request):
+        if own or self.name in _EVERYBODYS:
             return
         silent = station.election.commander_age_s > COMMANDER_SILENT_S
         raise _ProblemError(
@@ -231,6 +234,14 @@ class CommandTask:
         self._fail([name for name in self._open if name not in heard], *_NOT_HEARD)
         return heard
 
+    def _each(self, look: Callable[[str, RobotStatus], None]) -> Waits:
+        """Look at each open robot that is heard, again and again until all are settled."""
+        while heard := self._heard():
+            for name, status in heard.items():
+                look(name, status)
+            if self._open:
+                yield
+
     def _obeys(self, status: RobotStatus, sequence: int = 0) -> bool:
         commander = self._station.election.commander
         return status.operator == commander and status.obeyed_sequence >= sequence
@@ -264,28 +275,28 @@ class CommandTask:
         assigned = isinstance(self.request, SetOrigin | SetFence | SetWorld | SetPlaces)
         began_s = self._station.now_s
         obeyed_s: dict[str, float] = {}
-        while heard := self._heard():
+
+        def look(name: str, status: RobotStatus) -> None:
             now_s = self._station.now_s
-            for name, status in heard.items():
-                if not self._obeys(status, sequence):
-                    if now_s - began_s > _OBEY_S:
-                        self._fail([name], *self._not_obeying(status))
-                    continue
-                obeyed_s.setdefault(name, now_s)
-                how = effect(status)
-                if how is not None:
-                    self._settle(name, how)
-                elif not assigned and status.state in _NOT_STEERED:
-                    self._fail([name], *_why(status))
-                elif now_s - obeyed_s[name] > patience_s:
-                    code, text = _why(status)
-                    if assigned and status.not_taken:
-                        code, text = _C.NOT_TAKEN_UP, texts(status.not_taken)
-                    withdraw = isinstance(self.request, SetFence) and self.request.fence is not None
-                    help_ = "; `lpac mission fence on` withdraws it" if withdraw else ""
-                    self._fail([name], code, f"{text}{help_}")
-            if self._open:
-                yield
+            if not self._obeys(status, sequence):
+                if now_s - began_s > _OBEY_S:
+                    self._fail([name], *self._not_obeying(status))
+                return
+            obeyed_s.setdefault(name, now_s)
+            how = effect(status)
+            if how is not None:
+                self._settle(name, how)
+            elif not assigned and status.state in _NOT_STEERED:
+                self._fail([name], *_why(status))
+            elif now_s - obeyed_s[name] > patience_s:
+                code, text = _why(status)
+                if assigned and status.not_taken:
+                    code, text = _C.NOT_TAKEN_UP, texts(status.not_taken)
+                withdraw = isinstance(self.request, SetFence) and self.request.fence is not None
+                help_ = "; `lpac mission fence on` withdraws it" if withdraw else ""
+                self._fail([name], code, f"{text}{help_}")
+
+        yield from self._each(look)
 
     def _origin(self, request: SetOrigin) -> Waits:
         yield from self._take_up(
@@ -356,9 +367,9 @@ class CommandTask:
                 text = f"{seated[place.slot]} and {name} would share slot {place.slot}"
                 raise _ProblemError(ProblemCode.SLOT_SHARED, text)
 
-    def _refuse_without_origin(self, request: Enable | Takeoff) -> None:
+    def _refuse_without_origin(self, _: Enable | Takeoff) -> None:
         state = self._station.state
-        if (state is None or state.origin is None) and getattr(request, "on", True):
+        if self.name != "disable" and (state is None or state.origin is None):
             text = "no mission origin: set it with `lpac mission origin`"
             raise _ProblemError(ProblemCode.NO_ORIGIN, text)
 
@@ -397,20 +408,21 @@ class CommandTask:
         yield from self._obeyed(sequence)
         known: dict[str, RobotStatus] = {}
         changed_s = station.now_s
-        while heard := self._heard():
-            for name, status in heard.items():
-                flown = known.get(name)
-                if is_down(status):
-                    self._settle(name, *_came_down(request.action, flown, status))
-                elif status.state in _NOT_STEERED:
-                    self._fail([name], *_why(status))
-                elif flown is None or (flown.state, flown.reason) != (status.state, status.reason):
-                    known[name], changed_s = status, station.now_s
-                    self._say(name, _state_in_words(status))
-                elif station.now_s - changed_s > _LANDING_S:
-                    self._fail([name], *_why(status))
-            if self._open:
-                yield
+
+        def look(name: str, status: RobotStatus) -> None:
+            nonlocal changed_s
+            flown = known.get(name)
+            if is_down(status):
+                self._settle(name, *_came_down(request.action, flown, status))
+            elif status.state in _NOT_STEERED:
+                self._fail([name], *_why(status))
+            elif flown is None or (flown.state, flown.reason) != (status.state, status.reason):
+                known[name], changed_s = status, station.now_s
+                self._say(name, state_and_reason(status))
+            elif station.now_s - changed_s > _LANDING_S:
+                self._fail([name], *_why(status))
+
+        yield from self._each(look)
 
     def _obeyed(self, sequence: int = 0) -> Waits:
         """Each robot obeys that state, or has failed: what it said before counts no more."""
@@ -581,7 +593,7 @@ class CommandTask:
             if status.state in (_S.HOLD, _S.MISSION):
                 self._settle_up(name, status, status.reason.text)
             else:
-                self._fail([name], _C.WRONG_STATE, _state_in_words(status))
+                self._fail([name], _C.WRONG_STATE, state_and_reason(status))
 
     def _settle_up(self, name: str, status: RobotStatus, text: str) -> None:
         """Settle who has taken off; who was held up on its way is too low for a mission."""
@@ -604,32 +616,33 @@ class CommandTask:
         until_s = self._station.now_s + _START_S
         again_s: dict[str, float] = {}
         refusals: dict[str, Refusal] = {}
-        while heard := self._heard():
+
+        def look(name: str, status: RobotStatus) -> None:
+            nonlocal until_s
             now_s = self._station.now_s
-            for name, status in heard.items():
-                order_id = self._orders.get(name, "")
-                answer = self._station.orders.results.get(order_id)
-                if answer is not None and answer.refusal is not None:
-                    refusals[name] = answer.refusal
-                    again_s[name] = now_s + _START_AGAIN_S
-                    order_id = ""
-                    del self._orders[name]
-                if status.state is _S.MISSION and status.trial == trial:
-                    self._settle(name, f"flies the mission, trial {trial}")
-                elif now_s > until_s or status.state not in (_S.HOLD, _S.TAKEOFF):
-                    # Who has left hold since then is where it is for another reason.
-                    if name in refusals and status.state is _S.HOLD:
-                        self._refuse(name, refusals[name])
-                    else:
-                        rule = "" if status.state is _S.HOLD else "start is from hold: "
-                        code, text = _why(status)
-                        self._fail([name], code, f"{rule}{text}")
-                elif self._station.status(name) is None:
-                    until_s = now_s + _START_S
-                elif not order_id and status.state is _S.HOLD and now_s >= again_s.get(name, 0.0):
-                    self._order("start", name, trial)
-            if self._open:
-                yield
+            order_id = self._orders.get(name, "")
+            answer = self._station.orders.results.get(order_id)
+            if answer is not None and answer.refusal is not None:
+                refusals[name] = answer.refusal
+                again_s[name] = now_s + _START_AGAIN_S
+                order_id = ""
+                del self._orders[name]
+            if status.state is _S.MISSION and status.trial == trial:
+                self._settle(name, f"flies the mission, trial {trial}")
+            elif now_s > until_s or status.state not in (_S.HOLD, _S.TAKEOFF):
+                # Who has left hold since then is where it is for another reason.
+                if name in refusals and status.state is _S.HOLD:
+                    self._refuse(name, refusals[name])
+                else:
+                    rule = "" if status.state is _S.HOLD else "start is from hold: "
+                    code, text = _why(status)
+                    self._fail([name], code, f"{rule}{text}")
+            elif self._station.status(name) is None:
+                until_s = now_s + _START_S
+            elif not order_id and status.state is _S.HOLD and now_s >= again_s.get(name, 0.0):
+                self._order("start", name, trial)
+
+        yield from self._each(look)
 
     def _resume(self, _: Resume) -> Waits:
         station = self._station
@@ -642,7 +655,7 @@ class CommandTask:
             if is_down(status):
                 self._settle(name, "on the ground")
             elif status.state not in (_S.HOLD, _S.MISSION):
-                self._fail([name], _C.WRONG_STATE, _state_in_words(status))
+                self._fail([name], _C.WRONG_STATE, state_and_reason(status))
             elif not trial or status.trial != trial:
                 self._settle(name, "holds: it has not begun this trial; `lpac mission start`")
         yield from self._order_start(trial)
@@ -704,16 +717,16 @@ class CommandTask:
         station = self._station
         until_s = station.now_s + _OBEY_S
         station.election.take_command()
-        while heard := self._heard():
+
+        def look(name: str, status: RobotStatus) -> None:
             # Somebody else may change something at the same moment.
             station.election.take_command()
-            for name, status in heard.items():
-                if self._obeys(status):
-                    self._settle(name, f"obeys {station.operator}")
-                elif station.now_s > until_s:
-                    self._fail([name], *self._not_obeying(status))
-            if self._open:
-                yield
+            if self._obeys(status):
+                self._settle(name, f"obeys {station.operator}")
+            elif station.now_s > until_s:
+                self._fail([name], *self._not_obeying(status))
+
+        yield from self._each(look)
 
 
 # A robot flies itself down in none of these, and does not stop there.
@@ -729,10 +742,10 @@ _OBEYING_WORDS = {
     "land": {_S.LAND: "lands"},
 }
 
-# What each request does, and what is refused as a whole before it does anything.
 _Do = Callable[[CommandTask, Any], Waits]
 _Check = Callable[[CommandTask, Any], None]
-_DO: dict[type, tuple[_Do, _Check | None]] = {
+# What each command does, and the check that refuses it as a whole before.
+_DO: dict[type[Request], tuple[_Do, _Check | None]] = {
     SetOrigin: (CommandTask._origin, CommandTask._refuse_armed),
     SetFence: (CommandTask._fence, CommandTask._refuse_armed),
     SetWorld: (CommandTask._world, CommandTask._refuse_armed),
@@ -746,6 +759,14 @@ _DO: dict[type, tuple[_Do, _Check | None]] = {
     NextTrial: (CommandTask._again, CommandTask._refuse_on_mission),
     TakeCommand: (CommandTask._command, None),
 }
+# By their names. Everybody's need no command of the fleet, or take it on the way; urgent ones do
+# not wait until all are heard.
+_EVERYBODYS = ("hold", "land", "kill", "command")
+_URGENT = ("hold", "land", "kill")
+# These set robots in motion, or stop them. They end with another station's hold, and when one that
+# supersedes them begins for the same robots.
+_IN_FLIGHT = ("takeoff", "start", "hold", "return", "land", "resume")
+_SUPERSEDE = ("disable", "hold", "return", "land", "resume", "kill")
 
 
 class Commands:
@@ -769,16 +790,16 @@ class Commands:
         """Time has passed, or something was heard."""
         why, self._station.election.interruption = self._station.election.interruption, ""
         for running in self._running:
-            if why and self._is_interrupted(running.request):
+            if why and self._is_interrupted(running):
                 running.abandon(why, withdraw=True)
             running.step()
         self._running = [running for running in self._running if running.report is None]
 
-    def _is_interrupted(self, request: Request) -> bool:
+    def _is_interrupted(self, running: CommandTask) -> bool:
         """Another's hold ends what sets robots in motion; a new commander all that was wanted."""
         if self._station.commands:
-            return isinstance(request, _IN_FLIGHT)
-        return not isinstance(request, TakeCommand) and not _is_kill(request)
+            return running.name in _IN_FLIGHT
+        return running.name not in ("command", "kill")
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -787,66 +808,13 @@ class Commands:
 
     def _end_others(self, new: CommandTask) -> None:
         """Whatever else is wanted of the same robots' flight is so no more."""
-        if not _supersedes(new.request):
+        if new.name not in _SUPERSEDE:
             return
         for running in self._running:
             shared = set(running.names) & set(new.names)
-            same = _safety_action_of(running.request) == _safety_action_of(new.request) != ""
-            if running is new or same or not shared:
-                continue
-            if isinstance(running.request, _IN_FLIGHT):
+            same = running.name == new.name and isinstance(new.request, SafetyCommand)
+            if running is not new and shared and not same and running.name in _IN_FLIGHT:
                 running.abandon(new.text, withdraw=True)
-
-
-_IN_FLIGHT = (Takeoff, Start, Resume, SafetyCommand)
-
-
-def _safety_action_of(request: Request) -> str:
-    """Safety action of a request; "" if it is of another kind."""
-    return request.action if isinstance(request, SafetyCommand) else ""
-
-
-def _is_kill(request: Request) -> bool:
-    return isinstance(request, RobotCommand) and request.kind == "kill"
-
-
-def _supersedes(request: Request) -> bool:
-    if isinstance(request, Enable):
-        return not request.on
-    return isinstance(request, SafetyCommand | Resume) or _is_kill(request)
-
-
-def _is_hold(request: Request) -> bool:
-    return isinstance(request, SafetyCommand) and request.action == "hold"
-
-
-def _is_everybodys(request: Request) -> bool:
-    """Whether it needs no command of the fleet, or takes it on the way."""
-    is_land = isinstance(request, SafetyCommand) and request.action == "land"
-    return isinstance(request, TakeCommand) or is_land or _is_hold(request) or _is_kill(request)
-
-
-def in_words(request: Request) -> str:
-    """A command as `lpac mission` has it."""
-    match request:
-        case Enable(on=False):
-            text = "disable"
-        case SafetyCommand():
-            text = request.action
-        case RobotCommand():
-            text = request.kind
-        case SetWorld():
-            text = f"world {request.name}"
-        case SetPlaces():
-            text = "assign"
-        case NextTrial():
-            text = "again"
-        case TakeCommand():
-            text = "command"
-        case _:
-            text = type(request).__name__.removeprefix("Set").lower()
-    robots: tuple[str, ...] = getattr(request, "robots", ())
-    return f"{text} {','.join(robots)}" if robots else text
 
 
 def _addressed(station: Station, request: Request) -> tuple[str, ...]:
@@ -878,7 +846,7 @@ def _came_down(
     if status.position_m is not None:
         away_m = math.dist(status.position_m[:2], status.landing_point_m)
         where = f"{away_m:.0f} m from its landing point"
-    return f"landed {where}; last seen in flight in {_state_in_words(flown)}", _C.LANDED_ELSEWHERE
+    return f"landed {where}; last seen in flight in {state_and_reason(flown)}", _C.LANDED_ELSEWHERE
 
 
 def _is_home(flown: RobotStatus, status: RobotStatus) -> bool:
@@ -892,16 +860,11 @@ def _is_home(flown: RobotStatus, status: RobotStatus) -> bool:
 
 def _why(status: RobotStatus) -> tuple[ResultCode, str]:
     """Explain why a robot does not do what it was told, and what helps."""
-    text = _state_in_words(status)
+    text = state_and_reason(status)
     if status.state is _S.PILOT:
         return _C.WRONG_STATE, f"{text}; `lpac mission rejoin` takes it back"
     if status.state is _S.FAULT and status.armed is False:
         return _C.WRONG_STATE, f"{text}; look at it, then `lpac fleet restart`"
     if status.state is _S.PREFLIGHT and not status.ready:
-        checks = texts(status.failed_checks) or "the checks are still running"
-        return _C.NOT_READY, f"not ready: {checks}"
+        return _C.NOT_READY, f"not ready: {missing_checks(status)}"
     return _C.WRONG_STATE, text
-
-
-def _state_in_words(status: RobotStatus) -> str:
-    return f"{status.state}: {status.reason.text}"

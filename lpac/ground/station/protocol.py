@@ -11,6 +11,7 @@ robot's `Explored`, the last `GroundEvent`s, and then a `FleetSnapshot` at 5 Hz 
 rest as it happens, until the client leaves.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Literal, TypeVar
@@ -170,6 +171,55 @@ Request = (
     SetOrigin | SetFence | SetWorld | SetPlaces | Enable | Takeoff | Start | SafetyCommand
     | Resume | RobotCommand | NextTrial | TakeCommand
 )  # fmt: skip
+
+_NAMES_OF_COMMANDS: dict[type[Request], str] = {
+    SetOrigin: "origin", SetFence: "fence", SetWorld: "world", SetPlaces: "assign",
+    Takeoff: "takeoff", Start: "start", Resume: "resume", NextTrial: "again",
+    TakeCommand: "command",
+}  # fmt: skip
+
+
+def command_name(request: Request) -> str:
+    """The name of a command in `lpac mission`."""
+    match request:
+        case Enable():
+            return "enable" if request.on else "disable"
+        case SafetyCommand():
+            return request.action
+        case RobotCommand():
+            return request.kind
+    return _NAMES_OF_COMMANDS[type(request)]
+
+
+def of_robots(name: str, robots: tuple[str, ...]) -> Request:
+    """The command of that name for these robots, and nothing else of it chosen.
+
+    Raises KeyError if there is none that needs nothing else.
+    """
+    return _OF_ROBOTS[name](robots)
+
+
+_OF_ROBOTS: dict[str, Callable[[tuple[str, ...]], Request]] = {
+    "enable": lambda robots: Enable(True, robots),
+    "disable": lambda robots: Enable(False, robots),
+    "takeoff": Takeoff,
+    "start": Start,
+    "hold": lambda robots: SafetyCommand("hold", robots),
+    "return": lambda robots: SafetyCommand("return", robots),
+    "land": lambda robots: SafetyCommand("land", robots),
+    "resume": Resume,
+    "pilot": lambda robots: RobotCommand("pilot", robots),
+    "rejoin": lambda robots: RobotCommand("rejoin", robots),
+    "command": lambda _: TakeCommand(),
+}
+
+
+def in_words(request: Request) -> str:
+    """A command as `lpac mission` has it, with its robots."""
+    robots: tuple[str, ...] = getattr(request, "robots", ())
+    words = [command_name(request), getattr(request, "name", ""), ",".join(robots)]
+    return " ".join(filter(None, words))
+
 
 # Answers
 

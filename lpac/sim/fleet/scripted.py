@@ -28,13 +28,13 @@ from lpac.ground.script import (
     failures,
 )
 from lpac.ground.site import Sites
-from lpac.ground.station.commands import in_words
 from lpac.ground.station.protocol import (
     CommandReport,
     Request,
     RobotCommand,
     SafetyCommand,
     Start,
+    in_words,
 )
 from lpac.ground.station.station import is_down
 from lpac.sim.fleet.layout import ORIGIN

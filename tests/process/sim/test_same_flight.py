@@ -25,8 +25,7 @@ from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.alarms import Before, alarms
 from lpac.ground.procedure import fresh_snapshot
 from lpac.ground.station.client import subscribe
-from lpac.ground.station.commands import in_words
-from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
+from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S, in_words
 from lpac.sim.cores import over_cores
 from lpac.sim.description import FIELD_SCALE
 from lpac.sim.fleet.ground import GroundProgram

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from edge.identity.envelope import HEAD_BYTES
 from edge.messages.codec import decode
 from edge.messages.mission import FlightState, Order, OrderKind
 from edge.messages.topics import ORDER
@@ -127,7 +128,7 @@ class Commanded:
         hear = link._subscriptions[ORDER]
 
         def hear_order(key: str, data: bytes) -> None:
-            order = decode(Order, data)
+            order = decode(Order, data[HEAD_BYTES:])
             if order.robot_id != robot.robot_id or heard(order):
                 hear(key, data)
 

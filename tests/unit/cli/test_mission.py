@@ -9,7 +9,6 @@ import typer
 
 from edge.messages.mission import Origin
 from lpac.cli.mission import app
-from lpac.ground.station.commands import in_words
 from lpac.ground.station.protocol import (
     Enable,
     NextTrial,
@@ -24,6 +23,7 @@ from lpac.ground.station.protocol import (
     Start,
     TakeCommand,
     Takeoff,
+    in_words,
 )
 from tests.unit.cli.test_fleet import write_fleet
 
