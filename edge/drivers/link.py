@@ -17,10 +17,11 @@ def zenoh_link(setting: LinkSetting) -> ZenohLink | MulticastLink:
     zenoh = ZenohLink(
         fleet=setting.fleet,
         robot_id=setting.robot_id,
-        mode=setting.mode,
         listen=setting.listen,
         connect=setting.connect,
         scouting=setting.scouting,
+        # Robots in a group have nothing to say to each other besides: grounds call them.
+        autoconnect=setting.group is None,
         subscriptions={t: c for t, c in setting.subscriptions.items() if t not in in_group},
         tls=setting.tls,
         members=setting.members,

@@ -2,7 +2,8 @@
 
 On Wi-Fi the access point sends such a frame once, at its slow basic rate and without an
 acknowledgement: some are lost, which the policy takes, and ten times as many robots fit into a
-channel. Everything else goes over zenoh, by way of the fleet's router.
+channel. Everything else goes over zenoh, to and from the grounds, each of which is connected to all
+robots.
 """
 
 import math
@@ -39,6 +40,7 @@ _FORGETS_AFTER_S = 5.0
 # this robot says itself comes back all the same, and is no sign of one.
 _REJOINS_AFTER_S = 5.0
 _CLOSE_TIMEOUT_S = 1.0
+_CLAIMED_FOR_S = 3.0
 # A thread that wakes for each datagram finds its caches cold: where more than so many come in a
 # second, as of thirty robots, it takes those of such a time together. Where far more come, somebody
 # floods the group, and no buffer holds that for as long.
@@ -75,6 +77,7 @@ class MulticastLink:
         self._callbacks = {t: c for t, c in subscriptions.items() if t in TOPICS_OF_GROUP}
         self._keys = tuple(map(GroupKey.of, group.keys))
         self._own_start = -1  # Of this program, once it has spoken.
+        self._said_as_this_one_s = -math.inf
         self._assembly = Assembly(math.inf if group.is_secret else _FORGETS_AFTER_S)
         # No robot with a card has a greater one.
         self._greatest_id = MAX_CERTIFIED_ID if group.is_secret else MAX_ROBOT_ID
@@ -114,10 +117,12 @@ class MulticastLink:
 
     def is_claimed(self, robot_id: int) -> bool:
         """Whether another session says that it is that robot."""
-        return self._zenoh.is_claimed(robot_id)
+        said_s = self._said_as_this_one_s
+        is_said = robot_id == self._robot_id and time.monotonic() - said_s < _CLAIMED_FOR_S
+        return is_said or self._zenoh.is_claimed(robot_id)
 
     def peers(self) -> int:
-        """How many it is connected to by zenoh: the router, or none."""
+        """How many grounds it is connected to."""
         return self._zenoh.peers()
 
     def refused(self) -> int:
@@ -160,6 +165,8 @@ class MulticastLink:
                     continue
                 if not self._is_own(fragment):
                     heard_at_s = time.monotonic()
+                    if fragment.sender == self._robot_id and not self._group.is_secret:
+                        self._said_as_this_one_s = heard_at_s
                     self._take(fragment, heard_at_s)
             counted_s = time.monotonic() - counts_since_s
             if counted_s >= _COUNTS_FOR_S:
@@ -187,9 +194,11 @@ class MulticastLink:
     def _is_own(self, fragment: Fragment) -> bool:
         """Whether it comes back, or a stranger says it again, even from before this program began.
 
-        Of two programs with one id the other hears this one, which began later.
+        Of two members with one id the other hears this one, which began later.
         """
-        return fragment.sender == self._robot_id and fragment.number.start <= self._own_start
+        start = fragment.number.start
+        is_start = start <= self._own_start if self._group.is_secret else start == self._own_start
+        return fragment.sender == self._robot_id and is_start
 
     def _failed(self, what: str, error: Exception) -> None:
         with self._lock:

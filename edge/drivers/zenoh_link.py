@@ -12,9 +12,7 @@ connected and yet deaf to each other.
 
 With TLS both sides show a certificate of the fleet's authority, and what a peer says is taken by
 its certificate's common name: `robot-<id>` below its own key, `operator` below the ground's,
-`observer` there a hold only. Names of hosts are not looked at, since robots have none. A router
-passes on what others say: it looks at who says what instead, so that behind it only the signatures
-of the messages tell who they are.
+`observer` there a hold only. Names of hosts are not looked at, since robots have none.
 """
 
 import atexit
@@ -29,7 +27,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from threading import Event, Lock, Thread
-from typing import Literal, Self
+from typing import Self
 
 import zenoh
 
@@ -59,9 +57,6 @@ _MOST_TOKENS = 1000
 MAX_CERTIFIED_ID = 255
 _CLOSE_TIMEOUT_S = 1.0
 _KNOCKS_EVERY_S = 0.5
-# A client looks for its router so often, and waits so long for an answer.
-_ENTER_AGAIN_S = 0.3
-_ENTER_TIMEOUT_S = 1.0
 _CLOSE_AT_EXIT_S = 1.5
 
 # zenoh closes TCP sockets with a linger time of 10 s, which holds the closing thread for as long if
@@ -73,7 +68,6 @@ _RUNTIME = "(net: (handover: rx), rx: (worker_threads: 16))"
 _ADVICE = {
     "Address already in use": "another program has this port; does this robot's already run?",
     "Cannot assign requested address": "this machine has no such address",
-    "Unable to connect": "no router answers there; start it (`lpac fleet router`)",
 }
 
 
@@ -95,10 +89,10 @@ class ZenohLink:
         *,
         fleet: str,
         robot_id: int | None = None,
-        mode: Literal["peer", "client"] = "peer",
         listen: Sequence[str] = (),
         connect: Sequence[str] = (),
         scouting: bool = False,
+        autoconnect: bool = True,
         subscriptions: Mapping[Topic, ReceiveCallback] | None = None,
         tls: TlsFiles | None = None,
         members: Knocking | None = None,
@@ -106,10 +100,11 @@ class ZenohLink:
         """Open the session.
 
         `listen` and `connect` are endpoints, `tcp/<host>:<port>`, or with `tls` all of them
-        `tls/<host>:<port>`; without `listen` a peer takes a free port. It opens even if nobody
-        answers, a client even without its router, and connects later. `scouting` finds others by
-        multicast. With `members` it keeps strangers from the port that it listens on, unless those
-        that scouting finds call there, and knocks at others' (`edge.drivers.door`).
+        `tls/<host>:<port>`; without `listen` it takes a free port. It opens even if nobody answers,
+        and connects later. `scouting` finds others by multicast, as gossip does by those that are
+        connected; without `autoconnect` it calls none of them, and they call it. With `members` it
+        keeps strangers from the port that it listens on, unless those that scouting finds call
+        there, and knocks at others' (`edge.drivers.door`).
 
         `subscriptions` maps topics to callbacks. They are called with the key below `lpac/<fleet>/`
         and the data, from zenoh's threads, several at once; what this session publishes is not
@@ -118,7 +113,7 @@ class ZenohLink:
 
         Raises LinkError if a setting is wrong, or a port is taken.
         """
-        _check(fleet, robot_id, mode, listen, connect, scouting, tls)
+        _check(fleet, robot_id, listen, connect, tls)
         own: Sender = "ground" if robot_id is None else "robot"
         self._prefix = f"lpac/{fleet}/"
         self._own_prefix = self._prefix + (f"{own}/" if robot_id is None else f"{own}/{robot_id}/")
@@ -130,26 +125,27 @@ class ZenohLink:
         self._session_id = _session_id(robot_id)
         self._own_topics = [topic for topic in TOPICS if topic.sender == own]
         self._closed = Event()
-        self._entering: Thread | None = None
-        self._session: zenoh.Session | None = None
-        self._doors: list[Door] = []
-        self._knocking: Thread | None = None
+        config = _config(
+            self._prefix, self._session_id, listen, connect, scouting, autoconnect, tls
+        )
+        opened: list[zenoh.Session] = []
         if members is not None:
-            self._knocking = Thread(
-                target=self._knock, name="knock", args=(members, connect), daemon=True
-            )
-            self._knocking.start()
-        self._publishers: dict[Topic, zenoh.Publisher] = {}
-        config = _config(self._prefix, self._session_id, mode, listen, connect, scouting, tls)
-        # Members that found this port by scouting do not know where to knock.
-        known = None if scouting else members
-        enter = partial(self._enter, config, subscriptions or {}, known)
-        if mode == "client":
-            # zenoh opens no client without its router, which may come, or come back, in flight.
-            self._entering = Thread(target=self._enter_in_time, args=(enter,), daemon=True)
-            self._entering.start()
-        else:
-            enter()
+            # From before the first call on, which strangers make in vain.
+            Thread(
+                target=self._knock, name="knock", args=(members, connect, opened), daemon=True
+            ).start()
+        try:
+            # Members that found this port by scouting do not know where to knock.
+            self._session, self._doors = _open_behind_doors(config, None if scouting else members)
+        except BaseException:
+            self._closed.set()
+            raise
+        opened.append(self._session)
+        try:
+            self._publishers = self._declare(self._session, subscriptions or {})
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -160,14 +156,9 @@ class ZenohLink:
     def publish(self, topic: Topic, data: bytes) -> None:
         """Send on a topic of robots, or of the ground, as this session is one or the other.
 
-        Dropped when the link is congested, closed, or without its router. Raises KeyError for a
-        topic of the others.
+        Dropped when the link is congested or closed. Raises KeyError for a topic of the others.
         """
-        if topic not in self._own_topics:
-            raise KeyError(topic.name)
-        publisher = self._publishers.get(topic)
-        if publisher is None:
-            return
+        publisher = self._publishers[topic]
         try:
             publisher.put(data)
         except zenoh.ZError as error:
@@ -185,12 +176,9 @@ class ZenohLink:
         return robot_id in self._others()
 
     def peers(self) -> int:
-        """The number of zenoh peers and routers connected to this session."""
-        session = self._session
-        if session is None:
-            return 0
+        """The number of zenoh sessions connected to this one."""
         try:
-            return len(session.info.peers_zid()) + len(session.info.routers_zid())
+            return len(self._session.info.peers_zid())
         except zenoh.ZError:  # closed
             return 0
 
@@ -221,49 +209,20 @@ class ZenohLink:
             atexit.register(closing.join, _CLOSE_AT_EXIT_S)
 
     def _close_session(self) -> None:
-        if self._entering is not None:
-            self._entering.join()
-        if self._session is None:
-            return
         try:
             self._session.close()  # type: ignore[no-untyped-call]
         except zenoh.ZError as error:
             self._failed("close", error)
 
-    def _enter(
-        self,
-        config: zenoh.Config,
-        subscriptions: Mapping[Topic, ReceiveCallback],
-        known: Knocking | None,
+    def _knock(
+        self, members: Knocking, connect: Sequence[str], opened: Sequence[zenoh.Session]
     ) -> None:
-        """Raises LinkError."""
-        session, doors = _open_behind_doors(config, known)
-        try:
-            self._publishers = self._declare(session, subscriptions)
-        except BaseException:
-            for door in doors:
-                door.close()
-            session.close()  # type: ignore[no-untyped-call]
-            raise
-        self._session, self._doors = session, doors
-
-    def _enter_in_time(self, enter: Callable[[], None]) -> None:
-        """Once the router answers, or never."""
-        while not self._closed.is_set():
-            try:
-                enter()
-                break
-            except (LinkError, zenoh.ZError) as error:
-                self._failed("enter", error)
-            self._closed.wait(_ENTER_AGAIN_S)
-
-    def _knock(self, members: Knocking, connect: Sequence[str]) -> None:
         """At each port that it is to be connected to, until it is."""
         places = [endpoint.partition("/")[2] for endpoint in connect]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
             udp.setblocking(False)
             while True:
-                met = () if self._session is None else _met(self._session)
+                met = [place for session in opened for place in _met(session)]
                 for place in places:
                     host, _, port = place.rpartition(":")
                     if place not in met and not is_loopback(host):
@@ -345,76 +304,39 @@ class ZenohLink:
             return frozenset(id_ for id_, session in self._tokens if session != self._session_id)
 
 
-class ZenohRouter:
-    """Router that clients meet at: it passes on what they say, and says nothing itself.
-
-    Close it, or use it as a context manager.
-    """
-
-    def __init__(
-        self,
-        *,
-        fleet: str,
-        listen: Sequence[str],
-        tls: TlsFiles | None = None,
-        members: Knocking | None = None,
-    ) -> None:
-        """`listen` are endpoints and `members` who knocks, as `ZenohLink` has them.
-
-        With `tls` members alone are let in.
-
-        Raises LinkError if a setting is wrong, or a port is taken.
-        """
-        _check(fleet, None, "router", listen, (), False, tls)
-        config = _config(f"lpac/{fleet}/", _session_id(None), "router", listen, (), False, tls)
-        self._session, self._doors = _open_behind_doors(config, members)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """All clients are alone then, and look for it; again is no error."""
-        for door in self._doors:
-            door.close()
-        if not self._session.is_closed():
-            self._session.close()  # type: ignore[no-untyped-call]
-
-
 def _config(
     prefix: str,
     session_id: str,
-    mode: Literal["peer", "client", "router"],
     listen: Sequence[str],
     connect: Sequence[str],
     scouting: bool,
+    autoconnect: bool,
     tls: TlsFiles | None,
 ) -> zenoh.Config:
-    # Of two robots that find each other by scouting or gossip, the one of the greater id
+    # Of two sessions that find each other by scouting or gossip, the one of the greater id
     # connects: the same side as the configured endpoints make it.
-    once = {"autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}}}
+    found = {
+        "autoconnect": {"peer": ["peer"] if autoconnect else []},
+        "autoconnect_strategy": {"peer": {"to_peer": "greater-zid"}},
+    }
     # A call to somebody out of reach is repeated by the kernel after 1 s, and given up after 2:
     # whoever is back soon is called again within 1.1 s. One whose program is down refuses each
     # call at once, and soon is called seldom.
     retry = {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5}
-    if mode == "peer":
-        # Who calls nobody elsewhere need not be called from there.
-        host = "127.0.0.1" if connect and all(map(is_loopback_endpoint, connect)) else "0.0.0.0"
-        listen = listen or (f"{'tcp' if tls is None else 'tls'}/{host}:0",)
+    # Who calls nobody elsewhere need not be called from there.
+    host = "127.0.0.1" if connect and all(map(is_loopback_endpoint, connect)) else "0.0.0.0"
+    listen = listen or (f"{'tcp' if tls is None else 'tls'}/{host}:0",)
     config = zenoh.Config()
     for key, value in {
-        **({} if tls is None else _tls(prefix, mode, tls)),
+        **({} if tls is None else _tls(prefix, tls)),
         "id": session_id,
-        "mode": mode,
+        "mode": "peer",
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
         "connect/retry": retry,
-        **({"connect/timeout_ms": round(1000 * _ENTER_TIMEOUT_S)} if mode == "client" else {}),
         "scouting/delay": 0,
-        "scouting/multicast": {"enabled": scouting, **once},
-        "scouting/gossip": once,
+        "scouting/multicast": {"enabled": scouting, **found},
+        "scouting/gossip": found,
         # How soon a lost neighbour is noticed, ms; and how many signs of life that is. Whoever
         # speaks more often, as robots do in flight, sends none besides: with a sign each
         # quarter of a second, ten robots' took a quarter of a channel's time.
@@ -436,11 +358,8 @@ def _config(
             }
             for topic in TOPICS
         ],
-        # A state of its own for each connection, and before anything reaches this program. All that
-        # a client hears is of one connection: there the router has looked.
-        "downsampling": []
-        if mode == "client"
-        else [
+        # A state of its own for each connection, and before anything reaches this program.
+        "downsampling": [
             {
                 "flows": ["ingress"],
                 "messages": ["put"],
@@ -458,9 +377,9 @@ def _config(
     return config
 
 
-def _tls(prefix: str, mode: str, tls: TlsFiles) -> dict[str, object]:
+def _tls(prefix: str, tls: TlsFiles) -> dict[str, object]:
     """Only members get in, and say only what is theirs."""
-    settings: dict[str, object] = {
+    return {
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
             "root_ca_certificate": tls.authority,
@@ -471,10 +390,8 @@ def _tls(prefix: str, mode: str, tls: TlsFiles) -> dict[str, object]:
             "connect_private_key": tls.key,
             "connect_certificate": tls.certificate,
         },
+        "access_control": _access_control(prefix),
     }
-    if mode != "client":
-        settings["access_control"] = _access_control(prefix)
-    return settings
 
 
 def _access_control(prefix: str) -> dict[str, object]:
@@ -518,10 +435,8 @@ def _access_control(prefix: str) -> dict[str, object]:
 def _check(
     fleet: str,
     robot_id: int | None,
-    mode: str,
     listen: Sequence[str],
     connect: Sequence[str],
-    scouting: bool,
     tls: TlsFiles | None,
 ) -> None:
     if not re.fullmatch(r"[\w-]+", fleet):
@@ -535,8 +450,6 @@ def _check(
                 require_endpoint(name, endpoint, "tcp" if tls is None else "tls")
     except ValueError as error:
         raise LinkError(str(error)) from None
-    if mode == "client" and not (connect or scouting):
-        raise LinkError("mode = 'client' needs the router's endpoint in connect, or scouting")
     if tls is not None and robot_id is not None and robot_id > MAX_CERTIFIED_ID:
         raise LinkError(f"robot_id = {robot_id}: must be from 0 to {MAX_CERTIFIED_ID} with TLS")
 

@@ -138,7 +138,6 @@ class LinkSetting(NamedTuple):
 
     fleet: str
     robot_id: int | None
-    mode: Literal["peer", "client"]
     listen: tuple[str, ...]
     connect: tuple[str, ...]
     scouting: bool

@@ -127,15 +127,13 @@ def port_of(url: str) -> int:
 class LinkConfig:
     """How robots find each other: zenoh endpoints such as tcp/192.168.8.10:7447, or scouting.
 
-    A "client" talks through a router, which `connect` or scouting names; a "peer" needs none.
     Members of a fleet ([identity]) meet by TLS: tls/192.168.8.10:7447. Without an identity whoever
     reaches the radio can fly the robot: beyond this machine that must be said, by `insecure`.
     With `group` robots tell each other what they have to say by multicast, to that IPv4 address and
-    port, in the network of their own address `interface`. `type` is one of `edge.drivers.registry`;
-    `options` is what another type takes besides.
+    port, in the network of their own address `interface`, and grounds connect to them.
+    `type` is one of `edge.drivers.registry`; `options` is what another type takes besides.
     """
 
-    mode: Literal["peer", "client"] = "peer"
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     scouting: bool = False
@@ -150,8 +148,6 @@ class LinkConfig:
             return
         if not (self.listen or self.connect or self.scouting):
             raise ValueError("listen, connect and scouting: one of them must be set")
-        if self.mode == "client" and not (self.connect or self.scouting):
-            raise ValueError("mode = 'client': connect or scouting must be set")
         for name in ("listen", "connect"):
             for endpoint in getattr(self, name):
                 require_endpoint(name, endpoint, "tls", "tcp")
@@ -167,7 +163,7 @@ class LinkConfig:
     @property
     def leaves_machine(self) -> bool:
         """Whether somebody on another computer may be heard."""
-        if self.type != "zenoh" or self.scouting or not (self.listen or self.mode == "client"):
+        if self.type != "zenoh" or self.scouting or not self.listen:
             return True
         if self.group and not self.interface.startswith("127."):
             return True

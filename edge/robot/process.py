@@ -191,7 +191,7 @@ def _open_link(
     """The radio, as that robot, or with None as somebody who only listens."""
     link = config.link
     setting = LinkSetting(
-        config.fleet, robot_id, link.mode, link.listen, link.connect, link.scouting, link.options,
+        config.fleet, robot_id, link.listen, link.connect, link.scouting, link.options,
         node.subscriptions, None if identity is None else identity.tls, _group(config, identity),
         members,
     )  # fmt: skip

@@ -11,11 +11,11 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from msgspec import Meta
 
-from edge.core.address import host_and_port, ipv4, is_loopback_endpoint, require_host, same_host
+from edge.core.address import ipv4, is_loopback_endpoint, require_host, same_host
 from edge.core.schema import Bounded, ConfigError, PointXY, from_mapping
 from edge.core.toml import parse_toml, read_toml_text
 from edge.flight.margins import Margin, places_apart
@@ -95,13 +95,12 @@ class RadioConfig(Bounded):
     """How robots' messages get to the others.
 
     "mesh": each robot is connected to each, and sends to them one by one. "multicast": robots send
-    to all at once, in `group` (multicast address and port), and to the ground by way of `lpac fleet
-    router`, at `router` (IPv4 address and port). `type` and `options` are robot.toml's `link.type`
-    and `link.options`: a radio of your own, which is told all of this too.
+    to all at once, in `group` (multicast address and port). In both each ground is connected to all
+    robots. `type` and `options` are robot.toml's `link.type` and `link.options`: a radio of your
+    own, which is told all of this too.
     """
 
     transport: Transport = "mesh"
-    router: str = ""
     group: str = _GROUP
     type: Annotated[
         str, Meta(min_length=1, description="'zenoh', or the name of a radio of your own")
@@ -109,15 +108,6 @@ class RadioConfig(Bounded):
     options: dict[str, object] = field(default_factory=dict, hash=False)
 
     def check_rules(self) -> None:
-        if self.router and not _is_endpoint(self.router):
-            raise ValueError(
-                f"router = {self.router!r}: must be a computer's own IPv4 address and a port from "
-                "1 to 65535, such as '192.168.8.2:7447'"
-            )
-        if (self.transport == "mesh") == bool(self.router):
-            where = "must be where the router is, such as '192.168.8.2:7447'"
-            must = "must be left out" if self.router else where
-            raise ValueError(f"transport = {self.transport!r}: router = {self.router!r}: {must}")
         require_group("group", self.group)
         if self.transport == "mesh" and self.group != _GROUP:
             raise ValueError(f"transport = 'mesh': group = {self.group!r}: must be left out")
@@ -222,19 +212,9 @@ class FleetConfig:
         return f"{self.scheme}/{robot.address}:{robot.zenoh_port}"
 
     @property
-    def router(self) -> str | None:
-        """The router's endpoint, where the fleet has one."""
-        return f"{self.scheme}/{self.radio.router}" if self.radio.router else None
-
-    @property
-    def everybody(self) -> tuple[str, ...]:
-        """The endpoints by which zenoh reaches all robots: the router's, or those of each."""
-        return (self.router,) if self.router else tuple(map(self.endpoint, self.robots.values()))
-
-    @property
-    def mode(self) -> Literal["peer", "client"]:
-        """Mode of zenoh's sessions: clients of a router, or peers."""
-        return "client" if self.router else "peer"
+    def endpoints(self) -> tuple[str, ...]:
+        """Where zenoh reaches the robots."""
+        return tuple(map(self.endpoint, self.robots.values()))
 
     @property
     def scheme(self) -> str:
@@ -410,8 +390,7 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
 
 def _is_all_here(config: FleetConfig) -> bool:
     """Whether it is a fleet that this computer simulates."""
-    endpoints = [*map(config.endpoint, config.robots.values()), *config.everybody]
-    return bool(config.robots) and all(map(is_loopback_endpoint, endpoints))
+    return bool(config.robots) and all(map(is_loopback_endpoint, config.endpoints))
 
 
 def _without_empty(slot: Mapping[str, Any]) -> dict[str, Any]:
@@ -443,11 +422,6 @@ def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) ->
         cpus=_cpus(table.cpus),
         overrides=table.robot,
     )
-
-
-def _is_endpoint(text: str) -> bool:
-    found = host_and_port("router", text)
-    return found is not None and is_of_computer(found[0]) and found[1] > 0
 
 
 def is_of_computer(text: str) -> bool:
@@ -521,22 +495,16 @@ def _robot_mapping(
     config: FleetConfig, robot: RobotHost, slot: Slot, places: Places
 ) -> dict[str, Any]:
     """The robot's robot.toml, in that slot."""
-    earlier = (other for other in config.robots.values() if other.robot_id < robot.robot_id)
     # A fleet that is all on this computer needs no keys, and nobody else reaches it.
     listen = places.listen if config.keys or config.insecure else "127.0.0.1"
     link: dict[str, Any] = {
         "listen": [f"{config.scheme}/{listen}:{robot.zenoh_port}"],
-        "connect": [
-            config.endpoint(other) for other in sorted(earlier, key=lambda other: other.robot_id)
-        ],
     }
-    if config.router is not None:
-        link = {
-            "mode": "client",
-            "connect": [config.router],
-            "group": config.radio.group,
-            "interface": robot.address,
-        }
+    if config.radio.transport == "mesh":
+        earlier = (other for other in config.robots.values() if other.robot_id < robot.robot_id)
+        link["connect"] = list(map(config.endpoint, sorted(earlier, key=lambda r: r.robot_id)))
+    else:
+        link |= {"group": config.radio.group, "interface": robot.address}
     if config.radio.type != "zenoh":
         link |= {"type": config.radio.type, "options": config.radio.options}
     own = {

@@ -7,7 +7,7 @@ stations hear each other, on one channel, and around one access point:
   each receiver, station -> access point -> station, and so does TCP's acknowledgement.
 - `multicast`: what robots tell each other goes up once, acknowledged and at the data rate as all
   that a station sends, and down once for all, at the multicast rate and without acknowledgement.
-  What the ground hears or says goes by way of a router, to each robot by itself.
+  What the ground hears or says goes over TLS, to each robot by itself.
 
 Per transmission: DIFS, backoff, preamble, data, SIFS and acknowledgement. What goes to one station
 goes as one A-MPDU; and for a robot that sends, all that it has to say goes to the access point,
@@ -91,8 +91,8 @@ class Wifi(Bounded):
     `data_rate_mbit_s` is what stations and access point send frames to one receiver at,
     `multicast_rate_mbit_s` what the access point sends to a group at. `frame_loss` is the
     probability that one transmission of one frame is lost for reasons other than collisions.
-    `queue_s` is how long something waits in queues that are full. `ground_wired`: ground and router
-    are at the access point's wire; else they are one more station.
+    `queue_s` is how long something waits in queues that are full. `ground_wired`: the ground is at
+    the access point's wire; else it is one more station.
 
     The values that stand here are what docs/scaling.md assumes.
 

@@ -32,7 +32,7 @@ class RadioRecord(Bounded):
     said `message_hz` times a second to each that is to hear them, `received` arrived; ages are how
     long those travelled. `rate_mbit_s` and `signal_dbm` are of the receiver's Wi-Fi, `busy_share`
     is the share of the channel's time that somebody sent in, by anybody. `loaded`: a bulk stream
-    was sent meanwhile, on purpose. `ground_wired`: ground and router were not in the Wi-Fi.
+    was sent meanwhile, on purpose. `ground_wired`: the ground was not in the Wi-Fi.
 
     Raises ValueError that names an impossible value.
     """

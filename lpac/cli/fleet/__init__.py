@@ -17,13 +17,12 @@ from lpac.cli.fleet.field import doctor, ping, up
 from lpac.cli.fleet.keys import init, members, operator, revoke, rotate
 from lpac.cli.fleet.membership import enroll, pull, swap
 from lpac.cli.fleet.radio import radio
-from lpac.cli.fleet.router import router
 from lpac.cli.fleet.status import status
 
 app = new_app("fleet", "Deploy to the robots, start and stop them.")
 _COMMANDS: tuple[Callable[..., None], ...] = (
     deploy, rollback, start, stop, restart, land, status, logs,
-    doctor, up, ping, radio, router, enroll, swap, pull, init, operator, members, revoke, rotate,
+    doctor, up, ping, radio, enroll, swap, pull, init, operator, members, revoke, rotate,
 )  # fmt: skip
 for command in _COMMANDS:
     app.command()(command)

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from edge.core.schema import ConfigError
 from edge.core.world import parse_world
@@ -19,14 +18,13 @@ from lpac.fleet.settings import FleetConfig, load_fleet
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
     """`setup` is what its clients are told, `connect` the endpoints by which zenoh reaches all
-    robots, `mode` what it is there.
+    robots.
 
     `identity` is this station's in its fleet, None where nobody has one.
     """
 
     setup: FleetSetup
     connect: tuple[str, ...]
-    mode: Literal["peer", "client"]
     identity: Identity | None = None
 
 
@@ -77,8 +75,7 @@ def load_ground(
             ground_lost_land_s=robot.flight.ground_lost_land_s,
             insecure=config.insecure,
         ),
-        connect=config.everybody,
-        mode=config.mode,
+        connect=config.endpoints,
         identity=identity,
     )
 

@@ -100,7 +100,6 @@ class GroundProcess:
         _refuse_second(self._socket_path, fleet)
         with ZenohLink(
             fleet=fleet,
-            mode=self._config.mode,
             connect=self._config.connect,
             subscriptions={
                 topic: partial(received, hear) for topic, hear in self._node.subscriptions.items()

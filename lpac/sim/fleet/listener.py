@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from edge.drivers.identity_folder import load_identity
 from edge.drivers.zenoh_link import ZenohLink
@@ -38,18 +38,15 @@ class FleetListener:
         *,
         fleet: str,
         connect: Sequence[str],
-        mode: Literal["peer", "client"] = "peer",
         identity: Path | None = None,
         say: Say = lambda _: None,
     ) -> None:
-        """`connect` are the robots' endpoints, or with `mode` "client" their router's; `identity`
-        is the folder of its own, where they have one; `say` is told what cannot be understood, from
-        another thread.
+        """`connect` are the robots' endpoints; `identity` is the folder of its own, where they have
+        one; `say` is told what cannot be understood, from another thread.
         """
         self._fleet = fleet
         self._identity = identity
         self._connect = tuple(connect)
-        self._mode = mode
         self._say = say
         self._changed = threading.Condition()
         self._heard: dict[int, list[Heard]] = {}
@@ -64,8 +61,7 @@ class FleetListener:
             guard, tls, scheme = identity.guard(time.monotonic), identity.tls, "tls"
         self._link = ZenohLink(
             fleet=self._fleet,
-            mode=self._mode,
-            listen=(f"{scheme}/127.0.0.1:0",) if self._mode == "peer" else (),
+            listen=(f"{scheme}/127.0.0.1:0",),
             connect=self._connect,
             subscriptions=guard.subscriptions({STATUS: self._hear}),
             tls=tls,

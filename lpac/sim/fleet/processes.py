@@ -3,7 +3,6 @@
 import math
 import os
 import signal
-import socket
 import time
 from collections import deque
 from contextlib import ExitStack
@@ -111,31 +110,6 @@ class RobotProcess(LpacProgram):
         )
 
 
-class RouterProcess(LpacProgram):
-    """`lpac fleet router`: a context, in which it runs; what it prints is in router.log."""
-
-    def __init__(self, fleet_toml: Path, port: int) -> None:
-        super().__init__(
-            fleet_toml.with_name("router.log"), "fleet", "router", "--fleet", str(fleet_toml)
-        )
-        self._port = port
-
-    def __enter__(self) -> Self:
-        self.start()
-        # Robots would wait for it, and say so.
-        while self.running:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", self._port)) == 0:
-                    break
-            time.sleep(_LOOK_AGAIN_S)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.terminate()
-        if self.wait(STOP_WITHIN_S) is None:
-            self.kill()
-
-
 def process_usage(pid: int) -> Usage:
     """Measure a process of this machine so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -152,10 +126,9 @@ class Fleet:
 
     `layout` is what it is, `robots[i]` is robot i's process, `heard` what they say. `simulated` are
     the vehicles themselves, for whoever wants to do something to them; None where they are real
-    PX4. `endpoints` are the robots' zenoh addresses, `router` the program by which they reach the
-    ground in multicast, `name` the fleet's. `carried` is how many robots this machine was found to
-    carry; who finds it out says so. `fleet_toml` describes the fleet to `lpac ground`, as if its
-    robots were in the field.
+    PX4. `endpoints` are the robots' zenoh addresses, `name` the fleet's. `carried` is how many
+    robots this machine was found to carry; who finds it out says so. `fleet_toml` describes the
+    fleet to `lpac ground`, as if its robots were in the field.
     """
 
     def __init__(
@@ -186,18 +159,13 @@ class Fleet:
         else:
             starts_m = [self.layout.to_world_m(pad_m) for pad_m in self.layout.pads_m]
             self.vehicles = Px4Build(px4_build, starts_m, WORLD, self.folder / "px4")
-        *ports, router_port = free_ports(scenario.robots + 1)
+        *ports, group_port = free_ports(scenario.robots + 1)
         scheme = "tls" if scenario.secure else "tcp"
         self.endpoints = tuple(f"{scheme}/127.0.0.1:{port}" for port in ports)
-        self.router: RouterProcess | None = None
-        connect, radio = self.endpoints, {}
+        radio = {}
         if scenario.transport == "multicast":
-            self.router = RouterProcess(self.fleet_toml, router_port)
-            router = f"127.0.0.1:{router_port}"
-            connect = (f"{scheme}/{router}",)
             # A group of its own: another fleet's datagrams would be looked at, too.
-            group = f"239.255.76.80:{router_port}"
-            radio = {"transport": "multicast", "router": router, "group": group}
+            radio = {"transport": "multicast", "group": f"239.255.76.80:{group_port}"}
         self.name = f"sim-{ports[0]}"
         self.robots = tuple(
             RobotProcess(robot, self.folder / "robots" / str(robot))
@@ -208,8 +176,7 @@ class Fleet:
         keys = write_keys(self.folder, self.name, scenario.robots) if scenario.secure else None
         self.heard = FleetListener(
             fleet=self.name,
-            connect=connect,
-            mode="peer" if self.router is None else "client",
+            connect=self.endpoints,
             identity=keys,
             say=self.say_unless_behind,
         )
@@ -238,8 +205,6 @@ class Fleet:
         """Start everything. Raises OSError or LinkError if a port is taken."""
         with ExitStack() as stack:
             stack.enter_context(self.vehicles)
-            if self.router is not None:
-                stack.enter_context(self.router)
             stack.enter_context(self.heard)
             stack.callback(self._stop_robots)
             for robot in self.robots:

@@ -14,7 +14,8 @@ import pytest
 
 from edge.drivers import multicast
 from edge.drivers.link import zenoh_link
-from edge.drivers.zenoh_link import ZenohLink, ZenohRouter
+from edge.drivers.multicast import MulticastLink
+from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.card import Card, Revocations, Role, signed
 from edge.identity.envelope import HEAD_BYTES, Address, enclose, seal
 from edge.identity.group import PART_BYTES, GroupKey, datagrams
@@ -63,7 +64,7 @@ class Robot:
         self.guard = SignedGuard(membership, clock_s)
         self.radio = zenoh_link(
             LinkSetting(
-                "test", robot_id, "client", (), (at or endpoint(),), False, {},
+                "test", robot_id, (at or endpoint(),), (), False, {},
                 self.guard.subscriptions({MESSAGE: self._hear}), None, group,
             )
         )  # fmt: skip
@@ -124,7 +125,7 @@ def recording(group: Group) -> Iterator[list[bytes]]:
             thread.join()
 
 
-def test_robots_hear_each_other_without_router_or_ground(group: Group) -> None:
+def test_robots_hear_each_other_without_a_ground(group: Group) -> None:
     with Robot(group, 1) as first, Robot(group, 2) as second, Robot(group, 3) as third:
         for size in (0, 100, PART_BYTES, 3000):
             eventually_hear(first, b"1" * size, second, third)
@@ -136,7 +137,7 @@ def test_robots_hear_each_other_without_router_or_ground(group: Group) -> None:
 def test_cards_are_shown_in_haste_since_nothing_lost_is_sent_again(group: Group) -> None:
     now_s, messages, cards = 0.0, Inbox(), Inbox()
     setting = LinkSetting(
-        "test", None, "client", (), (endpoint(),), False, {},
+        "test", None, (endpoint(),), (), False, {},
         {MESSAGE: messages, CARD: cards}, None, group,
     )  # fmt: skip
     with zenoh_link(setting), Robot(group, 1, clock_s=lambda: now_s) as robot:
@@ -158,14 +159,13 @@ def test_cards_are_shown_in_haste_since_nothing_lost_is_sent_again(group: Group)
             eventually(partial(shown, count))
 
 
-def test_everything_else_goes_by_the_router(group: Group) -> None:
-    at, said = endpoint(), Inbox()
+def test_everything_else_goes_to_the_ground(group: Group) -> None:
+    places, said = [endpoint(), endpoint()], Inbox()
     with (
-        ZenohRouter(fleet="test", listen=[at]),
-        Robot(group, 1, at) as first,
-        Robot(group, 2, at) as second,
+        Robot(group, 1, places[0]) as first,
+        Robot(group, 2, places[1]) as second,
         ZenohLink(
-            fleet="test", mode="client", connect=[at],
+            fleet="test", connect=places,
             subscriptions=dict.fromkeys((MESSAGE, STATUS, CARD), said),
         ) as ground,
     ):  # fmt: skip
@@ -179,6 +179,29 @@ def test_everything_else_goes_by_the_router(group: Group) -> None:
         eventually(lambda: ground.present() == {1, 2} and first.radio.peers() == 1)
         # It would cross the air once more for each robot.
         assert "robot/1/message" not in said.newest
+
+
+def test_of_two_programs_without_keys_each_hears_that_the_other_has_its_id(group: Group) -> None:
+    everyones = group._replace(is_secret=False)
+
+    def program() -> MulticastLink:
+        return MulticastLink(
+            everyones, robot_id=1, subscriptions={},
+            zenoh=ZenohLink(fleet="test", robot_id=1, listen=[endpoint()], autoconnect=False),
+        )  # fmt: skip
+
+    with program() as first:
+        first.publish(MESSAGE, b"it comes back, and is no other's")
+        time.sleep(0.002)  # No two programs start within a millisecond.
+        with program() as second:
+
+            def both() -> bool:
+                first.publish(MESSAGE, b"one")
+                second.publish(MESSAGE, b"two")
+                return first.is_claimed(1) and second.is_claimed(1)
+
+            eventually(both)
+            assert not first.is_claimed(2)
 
 
 def test_strangers_are_not_heard_whatever_they_say(group: Group) -> None:

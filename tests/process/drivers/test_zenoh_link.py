@@ -5,7 +5,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -17,7 +16,7 @@ from typing import Any, Self
 import pytest
 import zenoh
 
-from edge.drivers.zenoh_link import LinkError, ZenohLink, ZenohRouter
+from edge.drivers.zenoh_link import LinkError, ZenohLink
 from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Topic
 from lpac.sim.ports import free_ports
 from tests.conftest import ROOT
@@ -213,37 +212,37 @@ def test_the_ground_speaks_to_all_robots_and_is_none() -> None:
         assert robot.present() == frozenset()
 
 
-def test_clients_meet_at_the_router_and_find_it_again() -> None:
-    at, heard, states = endpoint(), Inbox(), Inbox()
-    with (
-        # It comes after them, and goes.
-        ZenohLink(
-            fleet="test", robot_id=1, mode="client", connect=[at], subscriptions={STATE: states}
-        ) as first,
-        ZenohLink(
-            fleet="test", robot_id=2, mode="client", connect=[at], subscriptions={MESSAGE: heard}
-        ) as second,
-        ZenohLink(fleet="test", mode="client", connect=[at]) as ground,
-    ):
-        first.publish(MESSAGE, b"to nobody")
-        with pytest.raises(KeyError):
-            first.publish(STATE, b"not mine")
-        assert first.peers() == 0 and first.present() == frozenset()
+def test_without_autoconnect_robots_are_connected_to_grounds_alone() -> None:
+    """Gossip, by which grounds find each other, makes no mesh of such robots."""
+    places, statuses, states = [endpoint(), endpoint()], [Inbox(), Inbox()], Inbox()
+
+    def robot(robot_id: int) -> ZenohLink:
+        return ZenohLink(
+            fleet="test", robot_id=robot_id, listen=[places[robot_id]], autoconnect=False,
+            subscriptions={STATE: states},
+        )  # fmt: skip
+
+    def ground(number: int) -> ZenohLink:
+        return ZenohLink(
+            fleet="test", connect=places,
+            subscriptions=dict.fromkeys((STATUS, STATE), statuses[number]),
+        )  # fmt: skip
+
+    with robot(0) as first, robot(1) as second, ground(0) as one:
         for what in (b"before", b"after"):
-            with ZenohRouter(fleet="test", listen=[at]):
-                eventually_hears(first, MESSAGE, what, "robot/1/message", heard)
-                eventually_hears(ground, STATE, what, "ground/state", states)
-                eventually(lambda: first.present() == {2} and second.present() == {1})
-                eventually(lambda: ground.present() == {1, 2} and first.peers() == 1)
-            eventually(lambda: not first.present() and not second.present())
-
-
-def test_a_client_ends_though_its_router_never_came() -> None:
-    before = threading.active_count()
-    with ZenohLink(fleet="test", robot_id=1, mode="client", connect=[endpoint()]) as link:
-        eventually(lambda: link.failures() > 0)
-        assert threading.active_count() > before
-    eventually(lambda: threading.active_count() == before)
+            # It goes, and comes back.
+            with ground(1) as other:
+                for inbox in statuses:
+                    eventually_hears(first, STATUS, what, "robot/0/status", inbox)
+                    eventually_hears(second, STATUS, what, "robot/1/status", inbox)
+                eventually_hears(other, STATE, what, "ground/state", states)
+                eventually_hears(one, STATE, what * 2, "ground/state", states)
+                eventually_hears(one, STATE, what, "ground/state", statuses[1])
+                eventually_hears(other, STATE, what, "ground/state", statuses[0])
+                eventually(lambda: one.present() == {0, 1} and one.peers() == 3)
+                assert first.peers() == second.peers() == 2
+                assert first.present() == second.present() == frozenset()
+            eventually(lambda: first.peers() == second.peers() == 1)
 
 
 def test_scouting_finds_the_others() -> None:
@@ -398,16 +397,10 @@ def test_what_cannot_be_opened_is_said_in_one_line() -> None:
     )
     assert error(fleet="a/*").startswith("fleet = 'a/*': must be")
     assert error(robot_id=-1).startswith("robot_id = -1: must be")
-    assert "connect" in error(mode="client")
     with ZenohLink(fleet="test", listen=[taken]):
         assert taken in error(listen=[taken])
         assert "another program has this port" in error(listen=[taken])
     assert "no such address" in error(listen=["tcp/192.0.2.77:7447"])
-    with (
-        pytest.raises(LinkError, match="another program has this port"),
-        ZenohLink(fleet="test", listen=[taken]),
-    ):
-        ZenohRouter(fleet="test", listen=[taken])
 
 
 def test_grounds_hear_each_other_and_a_robot_gets_their_world_whole() -> None:

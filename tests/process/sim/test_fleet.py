@@ -175,34 +175,19 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
 
 
 @pytest.mark.real_time
-def test_a_fleet_in_multicast_finds_its_router_again(tmp_path: Path) -> None:
+def test_a_fleet_in_multicast_is_heard_by_each_ground_and_by_itself(tmp_path: Path) -> None:
     scenario = Scenario(robots=2, secure=True, transport="multicast")
     with Fleet(scenario, tmp_path, SHIPPED) as fleet:
         config = load_ground(fleet.fleet_toml, None)
-        assert config.mode == "client" and len(config.connect) == 1
-        for robot in fleet.robots:
+        assert config.connect == fleet.endpoints
+        for robot, endpoint in zip(fleet.robots, fleet.endpoints, strict=True):
             link = load_config(robot.folder / "robot.toml").link
-            assert (link.mode, link.listen, link.connect) == ("client", (), config.connect)
+            assert (link.listen, link.connect, link.interface) == ((endpoint,), (), "127.0.0.1")
         assert fleet.heard.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
-        before = {robot: its.boot_nonce for robot, its in fleet.heard.statuses().items()}
-        assert fleet.router is not None
-        fleet.router.__exit__(None, None, None)
-        assert fleet.heard.wait_for(lambda statuses: not statuses, 60.0)
-        fleet.router.__enter__()
-        assert fleet.heard.wait_for(
-            lambda statuses: {r: its.boot_nonce for r, its in statuses.items()} == before, 60.0
-        )
-
-
-@pytest.mark.real_time
-def test_with_multicast_robots_hear_each_other_without_the_router(tmp_path: Path) -> None:
-    scenario = Scenario(robots=2, secure=True, transport="multicast")
-    with Fleet(scenario, tmp_path, SHIPPED) as fleet:
-        assert fleet.router is not None
-        for robot in fleet.robots:
-            assert load_config(robot.folder / "robot.toml").link.interface == "127.0.0.1"
-        assert fleet.heard.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
-        fleet.router.__exit__(None, None, None)
+        keys = load_fleet(fleet.fleet_toml).keys
+        with FleetListener(fleet=fleet.name, connect=config.connect, identity=keys) as second:
+            assert second.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
+        fleet.heard.__exit__(None, None, None)
         gone_unix_s = time.time()
         assert fleet.heard.wait_for(lambda statuses: not statuses, 60.0)
     for robot in fleet.robots:

@@ -59,8 +59,8 @@ def test_endpoints_have_a_host_and_a_port() -> None:
             require_endpoint("listen", endpoint, "tcp")
     with pytest.raises(ValueError, match=r"^listen = '127.0.0.011': looks like"):
         require_endpoint("listen", "tcp/127.0.0.011:7447", "tcp")
-    assert host_and_port("router", "[::1]:7447") == ("::1", 7447)
-    assert host_and_port("router", "auto") is None
+    assert host_and_port("listen", "[::1]:7447") == ("::1", 7447)
+    assert host_and_port("listen", "auto") is None
 
 
 def test_what_is_out_of_other_computers_reach() -> None:

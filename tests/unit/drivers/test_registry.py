@@ -19,7 +19,7 @@ from edge.policy.bundle import Bundle, make_bundle, write_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from tests.conftest import SHIPPED
 
-LINK = LinkSetting("demo", None, "peer", (), (), True, {}, {}, None)
+LINK = LinkSetting("demo", None, (), (), True, {}, {}, None)
 VEHICLE = VehicleSetting("udpin://127.0.0.1:14999", 1, {})
 
 TYPES = ("added", "opened", "no_context", "raises", "no_device", "blind", "named", "forgetful")

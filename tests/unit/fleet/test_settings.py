@@ -162,28 +162,28 @@ def test_a_robot_gets_what_is_its_own(tmp_path: Path) -> None:
     assert str(tmp_path) not in robot_toml(config, "r3")
 
 
-def test_with_multicast_robots_are_in_a_group_and_clients_of_the_router(tmp_path: Path) -> None:
-    config = load_fleet(fleet_file(tmp_path, in_multicast("192.168.8.2:7447")))
+MULTICAST = "# [radio]", '[radio]\ntransport = "multicast"\n'
+
+
+def test_with_multicast_robots_are_in_a_group_and_connect_to_nobody(tmp_path: Path) -> None:
+    config = load_fleet(fleet_file(tmp_path, example(*MULTICAST)))
     for name, address in (("r1", "192.168.8.11"), ("r3", "192.168.8.13")):
         link = rendered(config, name, tmp_path).link
-        assert (link.mode, link.listen, link.connect) == (
-            "client", (), ("tls/192.168.8.2:7447",),
-        )  # fmt: skip
+        assert (link.listen, link.connect) == (("tls/0.0.0.0:7447",), ())
         assert (link.group, link.interface) == ("239.255.76.80:7450", address)
         assert link.leaves_machine
-    assert (config.mode, config.everybody) == ("client", ("tls/192.168.8.2:7447",))
     mesh = load_fleet(fleet_file(tmp_path, example()))
-    assert (mesh.mode, mesh.router) == ("peer", None)
-    assert mesh.everybody[0] == "tls/192.168.8.11:7447" and len(mesh.everybody) == 4
+    assert mesh.endpoints == config.endpoints
+    assert mesh.endpoints[0] == "tls/192.168.8.11:7447" and len(mesh.endpoints) == 4
 
 
 def test_a_radio_of_ones_own_is_told_what_the_built_in_one_is(tmp_path: Path) -> None:
-    text = in_multicast("192.168.8.2:7447").replace(
+    text = example(*MULTICAST).replace(
         'transport = "multicast"', 'transport = "multicast"\ntype = "lora"\noptions = {channel = 7}'
     )
     link = rendered(load_fleet(fleet_file(tmp_path, text)), "r3", tmp_path).link
     assert (link.type, link.options) == ("lora", {"channel": 7})
-    assert (link.mode, link.connect) == ("client", ("tls/192.168.8.2:7447",))
+    assert (link.group, link.interface) == ("239.255.76.80:7450", "192.168.8.13")
 
 
 @pytest.mark.parametrize(
@@ -198,21 +198,12 @@ def test_what_says_nothing_of_a_radio_is_refused(tmp_path: Path, lines: str, tol
         load_fleet(fleet_file(tmp_path, example("# [radio]", f"[radio]\n{lines}\n")))
 
 
-def in_multicast(place: str) -> str:
-    return example("# [radio]", f'[radio]\ntransport = "multicast"\nrouter = "{place}"\n')
-
-
-def test_robots_elsewhere_need_keys_though_their_router_is_here(tmp_path: Path) -> None:
-    assert load_fleet(fleet_file(tmp_path, in_multicast("127.0.0.1:7447"))).keys is not None
-
-
-def test_robots_of_this_computer_need_keys_if_their_router_is_elsewhere(tmp_path: Path) -> None:
-    here = re.sub(r"192\.168\.8\.(\d+)", r"127.0.0.\1", in_multicast("127.0.0.1:7447"))
-    here = re.sub(r'host = "127\.0\.0\.(\d+)"', r'host = "127.0.0.\1"', here)
+def test_robots_of_this_computer_need_no_keys(tmp_path: Path) -> None:
+    here = re.sub(r"192\.168\.8\.(\d+)", r"127.0.0.\1", example(*MULTICAST))
     config = load_fleet(fleet_file(tmp_path, here))
     assert config.keys is None
-    assert rendered(config, "r1", tmp_path).link.connect == ("tcp/127.0.0.1:7447",)
-    elsewhere = here.replace('router = "127.0.0.1:7447"', 'router = "192.168.8.2:7447"')
+    assert rendered(config, "r1", tmp_path).link.listen == ("tcp/127.0.0.1:7447",)
+    elsewhere = here.replace('host = "127.0.0.12"', 'host = "192.168.8.12"')
     assert load_fleet(fleet_file(tmp_path, elsewhere)).keys is not None
 
 
@@ -317,35 +308,19 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ('fleet = "demo"', 'fleet = "a b"', ["fleet = 'a b'", "letters"]),
         ("# [radio]", '[radio]\ntransport = "air"\n#', ["radio: transport = 'air'", "'mesh'"]),
         (
-            "# [radio]", '[radio]\ntransport = "router"\nrouter = "10.0.0.1:1"\n#',
+            "# [radio]", '[radio]\ntransport = "router"\n#',
             ["radio: transport = 'router': allowed are 'mesh', 'multicast'"],
         ),
-        (
-            "# [radio]", '[radio]\ntransport = "multicast"\n#',
-            ["radio: transport = 'multicast'", "where"],
-        ),
-        ("# [radio]", '[radio]\nrouter = "10.0.0.1:1"\n#', ["transport = 'mesh'", "left out"]),
-        (
-            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "10.0.0.1:1"\n'
-            'group = "10.0.0.2:7450"\n#', ["radio: group = '10.0.0.2:7450'", "239.255.76.80:7450"],
-        ),
-        (
-            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "laptop:7447"\n#',
-            ["radio: router = 'laptop:7447'", "192.168.8.2:7447"],
-        ),
+        ("# [radio]", '[radio]\nrouter = "10.0.0.1:1"\n#', ["radio: unknown key 'router'"]),
         *(
-            ("# [radio]", f'[radio]\ntransport = "multicast"\nrouter = "{router}"\n#',
-             [f"radio: router = '{router}'", "a computer's own IPv4", "1 to 65535", "192.168.8.2"])
-            for router in ("0.0.0.0:7447", "239.255.76.80:7450", "255.255.255.255:1", "10.0.0.1:0")
-        ),
-        (
-            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = ""\n#',
-            ["router = ''", "192.168.8.2:7447"],
-        ),
-        (
-            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "10.0.0.1:1"\n'
-            'group = "224.0.0.1:7450"\n#',
-            ["radio: group = '224.0.0.1:7450'", "none of 224.0.0.0/24", "239.255.76.80:7450"],
+            ("# [radio]", f'[radio]\ntransport = "multicast"\ngroup = "{group}"\n#',
+             [f"radio: group = '{group.rpartition(':')[0]}", *told])
+            for group, told in (
+                ("10.0.0.2:7450", ["239.255.76.80:7450"]),
+                ("224.0.0.1:7450", ["none of 224.0.0.0/24", "239.255.76.80:7450"]),
+                ("239.255.76.080:7450", ["'239.255.76.080': looks like an address"]),
+                ("239.255.76.80:\u0667", ["239.255.76.80:7450"]),
+            )
         ),
         (
             "# [radio]", '[radio]\ngroup = "239.1.2.3:7450"\n#',
@@ -390,19 +365,6 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         (
             '# mavlink_url = "udpin://127.0.0.1', 'mavlink_url = "udpin://127.0.0.011',
             ["robots.r1: mavlink_url = '127.0.0.011': looks like an address"],
-        ),
-        (
-            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "192.168.8.011:7447"\n#',
-            ["radio: router = '192.168.8.011': looks like an address"],
-        ),
-        (
-            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "192.168.8.2:\u0667"\n#',
-            ["radio: router = '192.168.8.2:\u0667': must be"],
-        ),
-        (
-            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "10.0.0.1:1"\n'
-            'group = "239.255.76.080:7450"\n#',
-            ["radio: group = '239.255.76.080': looks like an address"],
         ),
         (
             'host = "192.168.8.12"', 'host = "::ffff:192.168.8.11"\naddress = "192.168.8.12"',

@@ -141,7 +141,7 @@ def test_who_is_not_asked_about_takes_airtime_all_the_same(ask: Ask) -> None:
     [
         ("", "mesh at 220 Mbit/s (assumed);"),
         (
-            'transport = "multicast"\nrouter = "127.0.0.1:7447"',
+            'transport = "multicast"',
             "multicast at 220 Mbit/s, and 6 Mbit/s to all (both assumed);",
         ),
     ],

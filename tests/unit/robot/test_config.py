@@ -119,8 +119,6 @@ def test_relative_paths_are_meant_from_the_files_folder(
             "insecure = true # tcp",
             ["link.insecure = true: not with [identity]"],
         ),
-        ("connect = []", 'connect = []\nmode = "client"', ["link: mode = 'client'", "connect"]),
-        ("connect = []", 'connect = []\nmode = "router"', ["link: mode = 'router'", "'peer'"]),
         ("slot = 0", "slot = 40", ["slot = 40", "185 m", "ceiling_m = 30"]),
         ("[4.0, 4.0]", "[40.0, 4.0]", ["landing_point_m", "inside the fence"]),
         ("[4.0, 4.0]", "[4.0]", ["flight: landing_point_m = [4.0]", "[x, y]"]),
@@ -190,7 +188,6 @@ HERE, THERE = ("tcp/127.0.0.1:7447",), ("tcp/10.0.0.1:7447",)
         (LinkConfig(listen=HERE, scouting=True), True),
         # A peer that is not told where to listen does so everywhere.
         (LinkConfig(connect=HERE), True),
-        (LinkConfig(mode="client", connect=HERE), False),
         (LinkConfig(listen=HERE, group="239.1.2.3:7450", interface="10.0.0.1"), True),
         (LinkConfig(listen=HERE, group="239.1.2.3:7450", interface="127.0.0.1"), False),
         (LinkConfig(type="other", listen=HERE), True),
