@@ -19,7 +19,7 @@ from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.card import Card, Revocations, Role, signed
 from edge.identity.envelope import HEAD_BYTES, Address, enclose, seal
 from edge.identity.group import PART_BYTES, GroupKey, datagrams
-from edge.identity.guard import Membership, SignedGuard, Speaker
+from edge.identity.guard import Membership, SignedGuard, Speaker, Unguarded
 from edge.identity.news import MessageNumber
 from edge.identity.signature import Signer
 from edge.messages.topics import CARD, MESSAGE, STATUS, Group, Link, LinkSetting, Topic
@@ -190,18 +190,27 @@ def test_of_two_programs_without_keys_each_hears_that_the_other_has_its_id(group
             zenoh=ZenohLink(fleet="test", robot_id=1, listen=[endpoint()], autoconnect=False),
         )  # fmt: skip
 
-    with program() as first:
-        first.publish(MESSAGE, b"it comes back, and is no other's")
-        time.sleep(0.002)  # No two programs start within a millisecond.
-        with program() as second:
+    with program() as first, program() as second, program() as silent:
+        guards = Unguarded(1), Unguarded(2)
 
-            def both() -> bool:
-                first.publish(MESSAGE, b"one")
-                second.publish(MESSAGE, b"two")
-                return first.is_claimed(1) and second.is_claimed(1)
+        def speak(*links: MulticastLink) -> None:
+            for guard, link in zip(guards, links, strict=False):
+                guard.over(link).publish(MESSAGE, b"here")
 
-            eventually(both)
-            assert not first.is_claimed(2)
+        def silent_hears() -> bool:
+            speak(first)
+            return silent.is_claimed(1)
+
+        eventually(silent_hears)
+        # What comes back is no other's.
+        assert not first.is_claimed(1)
+
+        def both_hear() -> bool:
+            speak(first, second)
+            return first.is_claimed(1) and second.is_claimed(1)
+
+        eventually(both_hear)
+        assert not first.is_claimed(2)
 
 
 def test_strangers_are_not_heard_whatever_they_say(group: Group) -> None:
