@@ -27,7 +27,7 @@ from lpac.sim.scenario import Scenario
 
 EngineName = Literal["point", "simulated", "mavlink", "px4"]
 # What the drill does to a fleet, by engine.
-INJECTIONS: dict[EngineName, tuple[type, ...]] = {
+INJECTIONS: dict[EngineName, tuple[object, ...]] = {
     "point": (), "simulated": SUPPORTED, "mavlink": MAVLINK, "px4": PX4,
 }  # fmt: skip
 # Flights of these go one after another, with nothing beside them.

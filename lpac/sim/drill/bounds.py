@@ -1,13 +1,13 @@
-"""Promises of the drill: figures of a flight's record, with limits stated beforehand.
+"""Bounds of the drill: figures of a flight's record, with limits stated before the flight.
 
-`ALWAYS` counts in every flight, whatever is done to the fleet. Everything here is pure.
+`always` gives the bounds of every flight, whatever the fault. Everything here is pure.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,37 +19,36 @@ from lpac.analysis.truth import TrueTrack
 from lpac.sim.px4.errors import GREATEST_BIAS_M
 from lpac.sim.px4.modes import PILOTED, Px4Mode
 
-Whose = Literal["hit", "next", "others", "all", "first half", "second half"]
+RobotGroup = Literal["hit", "next", "others", "all", "first half", "second half"]
 
 _BUDGET = ErrorBudget()
-# What a simulated receiver errs by at worst, and how far wind carries half a drone.
+# The greatest error of a simulated receiver, drift in wind, and half a drone.
 POSITION_ERROR_M = GREATEST_BIAS_M + _BUDGET.wind_m + _BUDGET.drone_m / 2.0
 # A mode is told once a second, and a tick later it is obeyed.
 PILOT_NOTICED_S = 1.1
 # The operator wants the vehicle's mode ended, which PX4 tells late.
 _REJOIN_S = 4.0
-# What holds its place in gusts of 8 m/s does not go faster.
+# A vehicle that holds its position in gusts of 8 m/s stays below this.
 AT_REST_M_S = 0.5
-# Who lands beside another one lands so far away, by its own estimate and the other's, which may err
-# by 6 m from each other.
+# A robot lands this far beside another one, by both robots' estimates, which may differ by 6 m.
 _BESIDE_M, _ESTIMATES_ERR_M = 8.0, 6.0
 _NEAR_M = _BESIDE_M + _ESTIMATES_ERR_M
 _STEP_S = 0.06
-# How long an operator's order may take to start a motor, once it is answered.
+# An order may start a motor this long after its answer.
 _ARMED_AFTER_S = 1.0
-# From here a vehicle falls on its legs.
-_FALLS_M = 0.5
-# PX4 comes down at 1.5 m/s, and slower near what it takes to be the ground.
-_TOUCHDOWN_M_S = 2.0
+# A fall from here does no harm.
+FALLS_M = 0.5
+# PX4 descends at 1.5 m/s, and slower near its estimate of the ground.
+TOUCHDOWN_M_S = 2.0
 
-# A vehicle that is lower stands on the ground.
+# A lower vehicle stands on the ground.
 ON_GROUND_BELOW_M = 0.1
 
 LANDING = (Px4Mode.LAND, Px4Mode.DESCEND)
 
 
 class Figure(NamedTuple):
-    """Something measured: it must be `at_least` the limit, or else at most that."""
+    """A measured value and its limit: `at_least` a lower limit, else an upper one."""
 
     name: str
     value: float
@@ -59,14 +58,14 @@ class Figure(NamedTuple):
 
     @property
     def broken(self) -> bool:
-        """Whether it is beyond its limit, or not known."""
+        """Whether the value is beyond its limit, or unknown."""
         return not (self.value >= self.limit if self.at_least else self.value <= self.limit)
 
     @property
     def room(self) -> float:
-        """How far it is from its limit, as a share of that; below 0 if it is beyond.
+        """Distance from the limit, as a share of the limit; below 0 beyond it.
 
-        What must not happen at all, and did not, is not near.
+        inf for a count that must be 0, and is.
         """
         if not self.unit and self.limit == 0.0 and not self.broken:
             return math.inf
@@ -77,601 +76,472 @@ class Figure(NamedTuple):
 
 
 class Criterion(Protocol):
-    """One promise."""
+    """A bound of a flight."""
 
     def figure(self, flight: FlightRecord) -> Figure:
-        """Measure it in this flight."""
+        """Measure it in a flight."""
         ...
 
 
-# In every flight
+class Part(NamedTuple):
+    """One vehicle's `track` in the time window of a bound, which counts from `since_s`."""
+
+    flight: FlightRecord
+    robot: int
+    track: TrueTrack
+    since_s: float
+
+    def first_s(self, holds: Bools) -> float:
+        """Time from `since_s` until the condition (T,) first holds; inf if it never does."""
+        at_s = self.track.time_s[holds]
+        return float(at_s[0]) - self.since_s if len(at_s) else math.inf
+
+    @property
+    def killed(self) -> bool:
+        """Whether the operator kills the robot in this flight."""
+        return bool(self.flight.fault.ordered("kill", self.robot))
+
+    @property
+    def lands(self) -> Bools:
+        """(T,): whether the vehicle lands, or is disarmed."""
+        return self.track.is_in(*LANDING) | ~self.track.armed
+
+    @property
+    def flies_offboard(self) -> Bools:
+        """(T,): whether PX4 follows setpoints."""
+        return self.track.is_in(Px4Mode.OFFBOARD)
+
+    @property
+    def mission_setpoints_s(self) -> F64:
+        """Arrival times of the velocity setpoints that PX4 followed."""
+        at_s: F64 = self.track.setpoint_at_s[self.track.is_velocity & self.flies_offboard]
+        return at_s
+
+    @property
+    def heights_m(self) -> F64:
+        """(T,): height above the ground."""
+        heights_m: F64 = self.track.position_m[:, 2]
+        return heights_m
 
 
-@dataclass(frozen=True, slots=True)
-class Apart:
-    """No two vehicles touch in the air, and nobody comes down on one that stands."""
+@dataclass(frozen=True)
+class Bound(ABC):
+    """A bound on a group of vehicles, in a time window from the fault, or from the mark `after`.
+
+    The figure is the worst vehicle's value: the greatest (`worst` is max) must be at most the
+    limit, the least (min) at least; counts are added (sum). `start` is the figure of no vehicle.
+    """
+
+    name: ClassVar[str]
+    unit: ClassVar[str]
+    worst: ClassVar[Callable[[Iterable[float]], float]]
+    start: ClassVar[float]
+
+    limit: float = 0
+    robots: RobotGroup = "hit"
+    from_s: float = 0.0
+    until_s: float = math.inf
+    after: str = ""
+
+    def __init_subclass__(
+        cls, name: str = "", unit: str = "", worst: Any = max, start: float | None = None
+    ) -> None:
+        cls.name, cls.unit, cls.worst = name, unit, worst
+        cls.start = {max: 0.0, min: math.inf, sum: 0}[worst] if start is None else start
 
     def figure(self, flight: FlightRecord) -> Figure:
-        least_m = math.inf
-        for one, other in combinations(flight.vehicles, 2):
-            distance_m = _distances_m(one, other)
-            if len(distance_m):
-                least_m = min(least_m, float(distance_m.min()))
-        return Figure("true separation", least_m, flight.fault.drone_m, "m", at_least=True)
+        """Measure the worst of the vehicles."""
+        cls, fault = type(self), flight.fault
+        since_s = fault.marks[self.after] if self.after else fault.begin_s
+        values = [cls.start]
+        for robot in _robots(flight, self.robots):
+            track = flight.vehicles[robot].between(since_s + self.from_s, since_s + self.until_s)
+            values.append(self.measure(Part(flight, robot, track, since_s)))
+        limit, at_least = self.limit_in(flight), cls.worst is min
+        return Figure(self.told_as, cls.worst(values), limit, self.unit, at_least)
+
+    @property
+    def told_as(self) -> str:
+        """Name of the figure."""
+        return self.name
+
+    def limit_in(self, flight: FlightRecord) -> float:
+        """Limit, which may depend on the fleet."""
+        return self.limit
+
+    @abstractmethod
+    def measure(self, part: Part) -> float:
+        """Value of one vehicle."""
 
 
-@dataclass(frozen=True, slots=True)
-class AllKnown:
-    """The truth is known at all times: nothing that is not a number would break another promise."""
+@dataclass(frozen=True)
+class Always(Bound):
+    """A bound on all vehicles in the whole flight."""
 
-    def figure(self, flight: FlightRecord) -> Figure:
-        unknown = sum(
+    robots: RobotGroup = "all"
+    from_s: float = -math.inf
+
+
+class Apart(Always, name="true separation", unit="m", worst=min):
+    """No two vehicles touch in the air, and none comes down on a standing one."""
+
+    def limit_in(self, flight: FlightRecord) -> float:
+        return flight.fault.drone_m
+
+    def measure(self, part: Part) -> float:
+        others = part.flight.vehicles[part.robot + 1 :]
+        return min([math.inf, *(_least_distance_m(part.track, other) for other in others)])
+
+
+class AllKnown(Always, name="what is not a number", worst=sum):
+    """The true track is known throughout: NaN would break no other bound."""
+
+    def measure(self, part: Part) -> float:
+        return sum(
             int((~np.isfinite(each)).sum())
-            for vehicle in flight.vehicles
-            for each in (vehicle.position_m, vehicle.velocity_m_s)
+            for each in (part.track.position_m, part.track.velocity_m_s)
         )
-        return Figure("what is not a number", unknown, 0, "")
 
 
-@dataclass(frozen=True, slots=True)
-class InsideFence:
-    """Nobody but a pilot goes further beyond the fence's line than position errors explain.
+class InsideFence(Always, name="true fence margin", unit="m", worst=min):
+    """Only a pilot flies further beyond the fence than position errors explain."""
 
-    A fault may carry `whose` further.
+    def measure(self, part: Part) -> float:
+        edges, track = _fence(part.flight).edges(), part.track
+        flown_m = track.position_m[_above(track) & track.armed & ~_piloted(track), :2]
+        return min([math.inf, *(float(edges.distances_m(place_m).min()) for place_m in flown_m)])
+
+
+class CarriedBeyond(InsideFence, name="true fence margin of who is carried", unit="m", worst=min):
+    """The fault itself carries vehicles beyond the fence, by no more than that."""
+
+
+class BelowCeiling(Always, name="greatest height", unit="m"):
+    """Only a pilot flies higher above the fence's ceiling."""
+
+    def limit_in(self, flight: FlightRecord) -> float:
+        return _fence(flight).ceiling_m + self.limit
+
+    def measure(self, part: Part) -> float:
+        return float(np.where(_piloted(part.track), 0.0, part.heights_m).max(initial=0.0))
+
+
+class NoUnorderedStart(Always, name="motors started without an order", worst=sum):
+    """Motors start only on a fresh takeoff order to that robot, and once on each order."""
+
+    def measure(self, part: Part) -> float:
+        orders = part.flight.fault.ordered("takeoff", part.robot)
+        armed, unordered = part.track.armed, 0
+        for at_s in part.track.time_s[1:][armed[1:] & ~armed[:-1]].tolist():
+            obeyed = [o for o in orders if o.began_s <= at_s <= o.ended_s + _ARMED_AFTER_S]
+            if obeyed:
+                orders.remove(obeyed[0])
+            else:
+                unordered += 1
+        return unordered
+
+
+class NobodyFalls(Always, name="motors off at a height of", unit="m"):
+    """No motor stops in the air, unless the operator kills the robot."""
+
+    def measure(self, part: Part) -> float:
+        if part.killed:
+            return 0.0
+        armed = part.track.armed
+        return float(part.heights_m[1:][armed[:-1] & ~armed[1:]].max(initial=0.0))
+
+
+class ComesDownGently(Always, name="touches the ground at", unit="m/s"):
+    """No vehicle hits the ground, unless the operator kills the robot."""
+
+    def measure(self, part: Part) -> float:
+        if part.killed:
+            return 0.0
+        above = _above(part.track)
+        touches = np.flatnonzero(above[:-1] & ~above[1:])
+        return float(-part.track.velocity_m_s[touches, 2].min(initial=0.0))
+
+
+class PilotIsAlone(Always, name="last setpoint to a pilot's vehicle", unit="s"):
+    """A piloted vehicle gets no setpoints, once the program can know of the pilot."""
+
+    def measure(self, part: Part) -> float:
+        latest_s, track = 0.0, part.track
+        for begin_s, end_s in _spans_s(track, _piloted(track) & track.armed):
+            sent_s = np.unique(track.between(begin_s, end_s).setpoint_at_s)
+            sent_s = sent_s[(sent_s > begin_s) & (sent_s <= end_s)]
+            for order in part.flight.fault.ordered("rejoin", part.robot):
+                # The vehicle's clock is a step behind the order.
+                sent_s = sent_s[
+                    (sent_s < order.began_s - _STEP_S) | (sent_s > order.began_s + _REJOIN_S)
+                ]
+            if len(sent_s):
+                latest_s = max(latest_s, float(sent_s.max()) - begin_s)
+        return latest_s
+
+
+class AllDown(Always, name="not down in the end", worst=sum):
+    """All stand on the ground at the end, motors off."""
+
+    def measure(self, part: Part) -> float:
+        return bool(part.track.armed[-1] or _above(part.track)[-1])
+
+
+@dataclass(frozen=True)
+class FewCommands(Always):
+    """No vehicle gets more commands within any `within_s`: PX4 loses answers in a burst.
+
+    A real PX4 does not count them.
     """
 
-    beyond_m: float = POSITION_ERROR_M
-    whose: Whose = "all"
+    within_s: float = 1.0
 
-    def figure(self, flight: FlightRecord) -> Figure:
-        edges, margins_m = _fence(flight).edges(), [math.inf]
-        for vehicle in _of(flight, self.whose):
-            flown_m = vehicle.position_m[_above(vehicle) & vehicle.armed & ~_piloted(vehicle)]
-            margins_m += [float(edges.distances_m(place_m).min()) for place_m in flown_m[:, :2]]
-        of = " of who is carried" if self.beyond_m != POSITION_ERROR_M else ""
-        return Figure(f"true fence margin{of}", min(margins_m), -self.beyond_m, "m", at_least=True)
+    @property
+    def told_as(self) -> str:
+        return f"commands within {self.within_s:g} s"
 
-
-@dataclass(frozen=True, slots=True)
-class BelowCeiling:
-    """Nobody but a pilot flies higher above the fence's ceiling than stated."""
-
-    above_m: float = _BUDGET.height_m
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        highest_m = max(
-            float(np.where(_piloted(v), 0.0, v.position_m[:, 2]).max(initial=0.0))
-            for v in flight.vehicles
-        )
-        limit_m = _fence(flight).ceiling_m + self.above_m
-        return Figure("greatest height", highest_m, limit_m, "m")
+    def measure(self, part: Part) -> float:
+        time_s, commands = part.track.time_s, part.track.commands
+        before = np.searchsorted(time_s, time_s - self.within_s)
+        return int((commands - commands[before]).max(initial=0))
 
 
-@dataclass(frozen=True, slots=True)
-class NoUnorderedStart:
-    """No motor starts but on a takeoff order just given to that robot, and on each only once."""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        unordered = 0
-        for robot, vehicle in enumerate(flight.vehicles):
-            orders = flight.fault.ordered("takeoff", robot)
-            for at_s in _rises_s(vehicle):
-                obeyed = [o for o in orders if o.began_s <= at_s <= o.ended_s + _ARMED_AFTER_S]
-                if obeyed:
-                    orders.remove(obeyed[0])
-                else:
-                    unordered += 1
-        return Figure("motors started without an order", unordered, 0, "")
-
-
-@dataclass(frozen=True, slots=True)
-class NobodyFalls:
-    """No motor stops in the air, unless the operator kills that robot."""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        highest_m = 0.0
-        for vehicle in _unkilled(flight):
-            stops = np.flatnonzero(vehicle.armed[:-1] & ~vehicle.armed[1:]) + 1
-            highest_m = max(highest_m, float(vehicle.position_m[stops, 2].max(initial=0.0)))
-        return Figure("motors off at a height of", highest_m, _FALLS_M, "m")
-
-
-@dataclass(frozen=True, slots=True)
-class ComesDownGently:
-    """Nobody hits the ground, unless the operator kills that robot."""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        fastest_m_s = 0.0
-        for vehicle in _unkilled(flight):
-            touches = np.flatnonzero(_above(vehicle)[:-1] & ~_above(vehicle)[1:])
-            fastest_m_s = max(
-                fastest_m_s, float(-vehicle.velocity_m_s[touches, 2].min(initial=0.0))
-            )
-        return Figure("touches the ground at", fastest_m_s, _TOUCHDOWN_M_S, "m/s")
-
-
-@dataclass(frozen=True, slots=True)
-class PilotIsAlone:
-    """A vehicle that a pilot flies is sent nothing, once that can be known."""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        latest_s = 0.0
-        for robot, vehicle in enumerate(flight.vehicles):
-            rejoined_s = [order.began_s for order in flight.fault.ordered("rejoin", robot)]
-            for begin_s, end_s in _spans_s(vehicle, _piloted(vehicle) & vehicle.armed):
-                sent_s = np.unique(vehicle.between(begin_s, end_s).setpoint_at_s)
-                sent_s = sent_s[(sent_s > begin_s) & (sent_s <= end_s)]
-                for at_s in rejoined_s:
-                    # A vehicle's clock is a step behind what is done in between.
-                    sent_s = sent_s[(sent_s < at_s - _STEP_S) | (sent_s > at_s + _REJOIN_S)]
-                if len(sent_s):
-                    latest_s = max(latest_s, float(sent_s.max()) - begin_s)
-        return Figure("last setpoint to a pilot's vehicle", latest_s, PILOT_NOTICED_S, "s")
-
-
-@dataclass(frozen=True, slots=True)
-class AllDown:
-    """In the end all stand on the ground, with their motors off."""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        up = sum(bool(v.armed[-1] or _above(v)[-1]) for v in flight.vehicles)
-        return Figure("not down in the end", up, 0, "")
-
-
-@dataclass(frozen=True, slots=True)
-class FewCommands:
-    """No vehicle is sent more commands within any time so long: PX4 loses answers in a burst.
-
-    A real PX4 does not tell how many it is sent.
-    """
-
-    within_s: float
-    most: int
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        most = 0
-        for vehicle in flight.vehicles:
-            before = np.searchsorted(vehicle.time_s, vehicle.time_s - self.within_s)
-            most = max(most, int((vehicle.commands - vehicle.commands[before]).max(initial=0)))
-        return Figure(f"commands within {self.within_s:g} s", most, self.most, "")
-
-
-def always(beyond_fence_m: float, carried: Whose) -> tuple[Criterion, ...]:
-    """Bounds of every flight; a fault may itself bring the `carried` so far outside."""
-    inside: tuple[Criterion, ...] = (InsideFence(),)
+def always(beyond_fence_m: float, carried: RobotGroup) -> tuple[Criterion, ...]:
+    """Bounds of every flight; the fault itself may carry a group beyond the fence."""
+    inside: tuple[Criterion, ...] = (InsideFence(-POSITION_ERROR_M),)
     if beyond_fence_m != POSITION_ERROR_M:
-        inside = (InsideFence(beyond_fence_m, carried),)
-        if carried == "hit":
-            inside = (InsideFence(whose="others"), *inside)
+        others = (InsideFence(-POSITION_ERROR_M, "others"),) if carried == "hit" else ()
+        inside = (*others, CarriedBeyond(-beyond_fence_m, carried))
     return (
-        AllKnown(), Apart(), *inside, BelowCeiling(), NoUnorderedStart(), NobodyFalls(),
-        ComesDownGently(), PilotIsAlone(), AllDown(), FewCommands(1.0, 20), FewCommands(10.0, 60),
+        AllKnown(), Apart(), *inside, BelowCeiling(_BUDGET.height_m), NoUnorderedStart(),
+        NobodyFalls(FALLS_M), ComesDownGently(TOUCHDOWN_M_S), PilotIsAlone(PILOT_NOTICED_S),
+        AllDown(), FewCommands(20), FewCommands(60, within_s=10.0),
     )  # fmt: skip
 
 
-# Of one fault; times count from it, or from a mark
+class Lands(Bound, name="lands", unit="s"):
+    """The vehicle begins to land, by order or by itself, in time."""
+
+    def measure(self, part: Part) -> float:
+        return part.first_s(part.lands)
 
 
-@dataclass(frozen=True, slots=True)
-class Lands:
-    """The vehicle is told to land, or lands by itself, in time, and not sooner than stated."""
+class NotLandedBefore(Bound, name="lands no sooner", unit="s", worst=min):
+    """The vehicle lands no sooner."""
 
-    within_s: float
-    whose: Whose = "hit"
-    after: str = ""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        since_s = _since_s(flight, self.after)
-        delays_s = []
-        for vehicle in _of(flight, self.whose):
-            later = vehicle.between(since_s, math.inf)
-            at_s = later.time_s[later.is_in(*LANDING) | ~later.armed]
-            delays_s.append(float(at_s[0]) - since_s if len(at_s) else math.inf)
-        return Figure("lands", max(delays_s), self.within_s, "s")
+    def measure(self, part: Part) -> float:
+        return part.first_s(part.lands)
 
 
-@dataclass(frozen=True, slots=True)
-class NotLandedBefore:
-    """It does not land, or return, sooner than that."""
+class Down(Bound, name="down", unit="s"):
+    """The vehicle stands on the ground, motors off, in time."""
 
-    before_s: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        delays_s = []
-        for later in _parts(flight, self.whose):
-            at_s = later.time_s[later.is_in(*LANDING) | ~later.armed]
-            delays_s.append(float(at_s[0]) - flight.fault.begin_s if len(at_s) else math.inf)
-        return Figure("lands no sooner", min(delays_s), self.before_s, "s", at_least=True)
+    def measure(self, part: Part) -> float:
+        time_s, up = part.track.time_s, np.flatnonzero(part.track.armed | _above(part.track))
+        if not len(up):
+            return 0.0
+        return float(time_s[up[-1]]) - part.since_s if up[-1] + 1 < len(time_s) else math.inf
 
 
-@dataclass(frozen=True, slots=True)
-class Down:
-    """It stands on the ground, motors off, in time."""
+@dataclass(frozen=True)
+class Stands(Bound, name="speed at rest", unit="m/s"):
+    """The vehicle holds its position, by its own estimate, which may wander.
 
-    within_s: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        latest_s = 0.0
-        for later in _parts(flight, self.whose):
-            up = np.flatnonzero(later.armed | _above(later))
-            down = not len(up) or up[-1] + 1 < len(later.time_s)
-            at_s = float(later.time_s[up[-1]]) if len(up) else flight.fault.begin_s
-            latest_s = max(latest_s, at_s - flight.fault.begin_s if down else math.inf)
-        return Figure("down", latest_s, self.within_s, "s")
-
-
-@dataclass(frozen=True, slots=True)
-class Stands:
-    """From then on, and until then, it is not faster than what holds its place in wind.
-
-    That is, by its own estimate, which nobody tells that it wanders. Who `may_part` may leave
-    somebody who is near.
+    With `may_part` it may move away from a vehicle nearby.
     """
 
-    from_s: float
-    until_s: float
-    whose: Whose = "hit"
-    speed_m_s: float = AT_REST_M_S
-    after: str = ""
+    limit: float = AT_REST_M_S
     may_part: bool = False
 
-    def figure(self, flight: FlightRecord) -> Figure:
-        since_s, fastest_m_s = _since_s(flight, self.after), 0.0
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
-            moving = _above(part) & part.armed & ~part.is_in(*LANDING)
-            if self.may_part:
-                moving &= _alone_m(flight, vehicle, part.time_s) > _NEAR_M
-            speeds_m_s = np.hypot(*part.velocity_m_s[moving, :2].T)
-            speeds_m_s -= part.velocity_error_m_s[moving]
-            fastest_m_s = max(fastest_m_s, float(speeds_m_s.max(initial=0.0)))
-        return Figure("speed at rest", fastest_m_s, self.speed_m_s, "m/s")
+    def measure(self, part: Part) -> float:
+        track = part.track
+        moving = _above(track) & ~part.lands
+        if self.may_part:
+            moving &= _alone_m(part) > _NEAR_M
+        speeds_m_s = np.hypot(*track.velocity_m_s[moving, :2].T) - track.velocity_error_m_s[moving]
+        return float(speeds_m_s.max(initial=0.0))
 
 
-@dataclass(frozen=True, slots=True)
-class StaysNear:
-    """From then on, and until then, it stays that near to where it was, in the plane."""
+class StaysNear(Bound, name="from where it held", unit="m"):
+    """The vehicle stays near its place at the begin of the window, in the plane."""
 
-    from_s: float
-    until_s: float
-    within_m: float
-    whose: Whose = "hit"
-    after: str = ""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        since_s, farthest_m = _since_s(flight, self.after), 0.0
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
-            if len(part.time_s):
-                offsets_m = part.position_m[:, :2] - part.position_m[0, :2]
-                farthest_m = max(farthest_m, float(np.hypot(*offsets_m.T).max()))
-        return Figure("from where it held", farthest_m, self.within_m, "m")
+    def measure(self, part: Part) -> float:
+        return _farthest_m(part.track.position_m)
 
 
-@dataclass(frozen=True, slots=True)
-class StraightDown:
-    """From where it began to land it comes down within so many metres."""
+class StraightDown(Bound, name="drift while it lands", unit="m"):
+    """The vehicle comes down near the place where it began to land."""
 
-    within_m: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        farthest_m = 0.0
-        for later in _parts(flight, self.whose):
-            landing = later.position_m[later.is_in(*LANDING)]
-            if len(landing):
-                offset_m = landing[:, :2] - landing[0, :2]
-                farthest_m = max(farthest_m, float(np.hypot(*offset_m.T).max()))
-            else:
-                farthest_m = math.inf
-        return Figure("drift while it lands", farthest_m, self.within_m, "m")
+    def measure(self, part: Part) -> float:
+        landing_m = part.track.position_m[part.track.is_in(*LANDING)]
+        return _farthest_m(landing_m) if len(landing_m) else math.inf
 
 
-@dataclass(frozen=True, slots=True)
-class LandApart:
-    """They come down as far from each other as robots that looked."""
+@dataclass(frozen=True)
+class LandApart(Always, name="landed apart", unit="m", worst=min):
+    """Vehicles that land avoid each other."""
 
-    whose: Whose = "all"
+    limit: float = _BESIDE_M - _ESTIMATES_ERR_M
 
-    def figure(self, flight: FlightRecord) -> Figure:
-        landed = [v for v in _of(flight, self.whose) if v.is_in(*LANDING).any()]
-        least_m = min(
-            (
-                math.dist(one.position_m[-1, :2], other.position_m[-1, :2])
-                for one, other in combinations(landed, 2)
-            ),
-            default=math.inf,
+    def measure(self, part: Part) -> float:
+        robots = _robots(part.flight, self.robots)
+        others = [part.flight.vehicles[robot] for robot in robots if robot > part.robot]
+        if not part.track.is_in(*LANDING).any():
+            return math.inf
+        place_m = part.track.position_m[-1, :2]
+        landed = (other for other in others if other.is_in(*LANDING).any())
+        return min([math.inf, *(math.dist(place_m, each.position_m[-1, :2]) for each in landed)])
+
+
+class LandsAtPad(Bound, name="from its pad", unit="m"):
+    """The vehicle lands near its own pad, or beside, where a stray vehicle lies near the pad."""
+
+    def measure(self, part: Part) -> float:
+        pads_m = part.flight.fault.pads_m
+        places_m = [vehicle.position_m[-1, :2] for vehicle in part.flight.vehicles]
+        away_m = [math.dist(*each) for each in zip(places_m, pads_m, strict=False)]
+        is_beside = any(
+            away > self.limit and math.dist(stray_m, pads_m[part.robot]) < _NEAR_M
+            for robot, (stray_m, away) in enumerate(zip(places_m, away_m, strict=False))
+            if robot != part.robot
         )
-        return Figure("landed apart", least_m, _BESIDE_M - _ESTIMATES_ERR_M, "m", at_least=True)
+        return away_m[part.robot] - (_BESIDE_M if is_beside else 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class LandsAtPad:
-    """It lands within so many metres of the pad it stood on.
+class FliesOn(Bound, name="share of the mission", worst=min, start=1.0):
+    """The vehicle flies its mission for at least that share of the window."""
 
-    Where somebody lies near that came down elsewhere than on its own, it may land beside.
-    """
-
-    within_m: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        farthest_m = 0.0
-        places_m = [vehicle.position_m[-1, :2] for vehicle in flight.vehicles]
-        strays_m = [
-            place_m
-            for place_m, pad_m in zip(places_m, flight.fault.pads_m, strict=False)
-            if math.dist(place_m, pad_m) > self.within_m
-        ]
-        for robot in _robots(flight, self.whose):
-            place_m, pad_m = places_m[robot], flight.fault.pads_m[robot]
-            away_m = math.dist(place_m, pad_m)
-            is_beside = any(
-                place_m is not stray_m and math.dist(stray_m, pad_m) < _NEAR_M
-                for stray_m in strays_m
-            )
-            farthest_m = max(farthest_m, away_m - _BESIDE_M if is_beside else away_m)
-        return Figure("from its pad", farthest_m, self.within_m, "m")
+    def measure(self, part: Part) -> float:
+        flown = part.flies_offboard & part.track.is_velocity & _above(part.track)
+        return float(flown.mean()) if len(flown) else -math.inf
 
 
-@dataclass(frozen=True, slots=True)
-class FliesOn:
-    """It flies its mission for at least that share of the time."""
+class ComesBack(Bound, name="flown beyond the fence", unit="s"):
+    """The vehicle is back inside in time, but for position errors, or PX4 holds or lands it."""
 
-    until_s: float
-    share: float = 0.9
-    whose: Whose = "others"
-    from_s: float = 0.0
-    after: str = ""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        since_s, shares = _since_s(flight, self.after), [1.0]
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
-            flown = part.is_in(Px4Mode.OFFBOARD) & part.is_velocity & _above(part)
-            shares.append(float(flown.mean()) if len(flown) else -math.inf)
-        least = min(shares)
-        return Figure("share of the mission", least, self.share, "", at_least=True)
+    def measure(self, part: Part) -> float:
+        edges, track, latest_s = _fence(part.flight).edges(), part.track, 0.0
+        flown = _above(track) & ~part.lands & ~track.is_in(Px4Mode.HOLD)
+        for at_s, place_m in zip(track.time_s[flown], track.position_m[flown, :2], strict=True):
+            if edges.distances_m(place_m).min() < -POSITION_ERROR_M:
+                latest_s = float(at_s) - part.since_s
+        return latest_s
 
 
-@dataclass(frozen=True, slots=True)
-class ComesBack:
-    """Once so much time has passed, it is back inside, or PX4 holds or lands it.
+class Moves(Bound, name="flies at least", unit="m", worst=min):
+    """The vehicle flies at least so far, in the plane."""
 
-    Inside as far as position errors explain.
-    """
-
-    within_s: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        edges, latest_s = _fence(flight).edges(), 0.0
-        for part in _parts(flight, self.whose):
-            flown = _above(part) & part.armed & ~part.is_in(Px4Mode.HOLD, *LANDING)
-            for at_s, place_m in zip(part.time_s[flown], part.position_m[flown, :2], strict=True):
-                if edges.distances_m(place_m).min() < -POSITION_ERROR_M:
-                    latest_s = max(latest_s, float(at_s) - flight.fault.begin_s)
-        return Figure("flown beyond the fence", latest_s, self.within_s, "s")
+    def measure(self, part: Part) -> float:
+        return float(np.hypot(*np.diff(part.track.position_m[:, :2], axis=0).T).sum())
 
 
-@dataclass(frozen=True, slots=True)
-class Moves:
-    """In its mission it gets about: the way that it flies, in the plane."""
+class Holds(Bound, name="PX4 holds", unit="s"):
+    """PX4 holds the vehicle in time, as the watchdog asks."""
 
-    least_m: float
-    until_s: float
-    whose: Whose = "all"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        ways_m = [
-            float(np.hypot(*np.diff(part.position_m[:, :2], axis=0).T).sum())
-            for part in _parts(flight, self.whose, until_s=self.until_s)
-        ]
-        return Figure("flies at least", min(ways_m), self.least_m, "m", at_least=True)
+    def measure(self, part: Part) -> float:
+        return part.first_s(part.track.is_in(Px4Mode.HOLD))
 
 
-@dataclass(frozen=True, slots=True)
-class Holds:
-    """PX4 holds it in time, as the watchdog asks."""
+@dataclass(frozen=True)
+class KeepsAway(Always, name="keeps away", unit="m", worst=min):
+    """The next vehicle keeps that far away from the hit one, in the air."""
 
-    within_s: float
-    whose: Whose = "hit"
+    robots: RobotGroup = "hit"
 
-    def figure(self, flight: FlightRecord) -> Figure:
-        delays_s = []
-        for later in _parts(flight, self.whose):
-            at_s = later.time_s[later.is_in(Px4Mode.HOLD)]
-            delays_s.append(float(at_s[0]) - flight.fault.begin_s if len(at_s) else math.inf)
-        return Figure("PX4 holds", max(delays_s), self.within_s, "s")
+    def measure(self, part: Part) -> float:
+        vehicles = part.flight.vehicles
+        return _least_distance_m(part.track, vehicles[(part.robot + 1) % len(vehicles)])
 
 
-@dataclass(frozen=True, slots=True)
-class KeepsAway:
-    """The one that it was not done to, but whom it concerns, stays so far away, in the air."""
+class MissionEnds(Bound, name="last of the mission", unit="s"):
+    """The last velocity setpoint of the window comes in time."""
 
-    least_m: float
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        least_m = math.inf
-        for robot, following in zip(flight.fault.hit, _robots(flight, "next"), strict=True):
-            one, other = flight.vehicles[robot], flight.vehicles[following]
-            least_m = min(least_m, float(_distances_m(one, other).min(initial=math.inf)))
-        return Figure("keeps away", least_m, self.least_m, "m", at_least=True)
+    def measure(self, part: Part) -> float:
+        return float(part.mission_setpoints_s.max(initial=part.since_s)) - part.since_s
 
 
-@dataclass(frozen=True, slots=True)
-class MissionEnds:
-    """The last velocity setpoint comes in time; until then nothing like it comes again."""
-
-    within_s: float
-    until_s: float = math.inf
-    whose: Whose = "hit"
-    after: str = ""
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        since_s, latest_s = _since_s(flight, self.after), 0.0
-        for vehicle in _of(flight, self.whose):
-            part = vehicle.between(since_s, since_s + self.until_s)
-            flown = part.setpoint_at_s[part.is_velocity & part.is_in(Px4Mode.OFFBOARD)]
-            latest_s = max(latest_s, float(flown.max(initial=since_s)) - since_s)
-        return Figure("last of the mission", latest_s, self.within_s, "s")
-
-
-@dataclass(frozen=True, slots=True)
-class LeavesMission:
-    """So long after it was so far below its height, the last velocity setpoint has come."""
+@dataclass(frozen=True, kw_only=True)
+class LeavesMission(Bound, name="leaves the mission", unit="s", start=-math.inf):
+    """The last velocity setpoint comes in time after the vehicle sank by `below_m`."""
 
     below_m: float
-    within_s: float
-    whose: Whose = "hit"
 
-    def figure(self, flight: FlightRecord) -> Figure:
-        latest_s = -math.inf
-        for part in _parts(flight, self.whose):
-            height_m = part.position_m[:, 2]
-            low = np.flatnonzero(height_m < height_m[0] - self.below_m)
-            flown = part.setpoint_at_s[part.is_velocity & part.is_in(Px4Mode.OFFBOARD)]
-            ended_s = float(flown.max(initial=flight.fault.begin_s))
-            latest_s = max(latest_s, ended_s - float(part.time_s[low[0]]) if len(low) else math.inf)
-        return Figure("leaves the mission", latest_s, self.within_s, "s")
+    def measure(self, part: Part) -> float:
+        low = np.flatnonzero(part.heights_m < part.heights_m[0] - self.below_m)
+        ended_s = float(part.mission_setpoints_s.max(initial=part.since_s))
+        return ended_s - float(part.track.time_s[low[0]]) if len(low) else math.inf
 
 
-@dataclass(frozen=True, slots=True)
-class FallsSilent:
-    """Nothing is sent to the vehicle any more."""
+class FallsSilent(Bound, name="last setpoint", unit="s"):
+    """The last setpoint of the window comes in time."""
 
-    within_s: float
-    until_s: float = math.inf
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        latest_s = 0.0
-        for part in _parts(flight, self.whose, until_s=self.until_s):
-            sent_s = float(part.setpoint_at_s.max(initial=flight.fault.begin_s))
-            latest_s = max(latest_s, sent_s - flight.fault.begin_s)
-        return Figure("last setpoint", latest_s, self.within_s, "s")
+    def measure(self, part: Part) -> float:
+        return float(part.track.setpoint_at_s.max(initial=part.since_s)) - part.since_s
 
 
-@dataclass(frozen=True, slots=True)
-class SentNothing:
-    """No setpoint comes from then on, and until then."""
+class SentNothing(Bound, name="setpoints after the lapse", worst=sum):
+    """No setpoint comes in the window."""
 
-    from_s: float
-    until_s: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        """How many came."""
-        begin_s, end_s = flight.fault.begin_s + self.from_s, flight.fault.begin_s + self.until_s
-        sent = 0
-        for vehicle in _of(flight, self.whose):
-            at_s = np.unique(vehicle.between(begin_s, end_s).setpoint_at_s)
-            sent += int(((at_s > begin_s) & (at_s < end_s)).sum())
-        return Figure("setpoints after the lapse", sent, 0, "")
+    def measure(self, part: Part) -> float:
+        at_s = np.unique(part.track.setpoint_at_s)
+        begin_s, end_s = part.since_s + self.from_s, part.since_s + self.until_s
+        return int(((at_s > begin_s) & (at_s < end_s)).sum())
 
 
-@dataclass(frozen=True, slots=True)
-class StaysDown:
-    """Its motors never start."""
+class StaysDown(Bound, name="took off", worst=sum):
+    """The motors never start."""
 
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        started = sum(
-            bool(v.between(flight.fault.begin_s, math.inf).armed.any())
-            for v in _of(flight, self.whose)
-        )
-        return Figure("took off", started, 0, "")
+    def measure(self, part: Part) -> float:
+        return bool(part.track.armed.any())
 
 
-@dataclass(frozen=True, slots=True)
-class TakesOff:
-    """It flies, somewhen after the fault."""
+@dataclass(frozen=True)
+class TakesOff(Bound, name="took off", worst=min):
+    """The vehicle takes off after the fault."""
 
-    whose: Whose = "all"
+    limit: float = 1
 
-    def figure(self, flight: FlightRecord) -> Figure:
-        flew = min(
-            bool((v.armed & _above(v))[v.time_s > flight.fault.begin_s].any())
-            for v in _of(flight, self.whose)
-        )
-        return Figure("took off", flew, 1, "", at_least=True)
+    def measure(self, part: Part) -> float:
+        return bool((part.track.armed & _above(part.track)).any())
 
 
-@dataclass(frozen=True, slots=True)
-class MotorsOff:
-    """They stop in time, also in the air."""
+class MotorsOff(Bound, name="motors off", unit="s"):
+    """The motors stop in time, also in the air."""
 
-    within_s: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        latest_s = 0.0
-        for later in _parts(flight, self.whose):
-            off_s = later.time_s[~later.armed]
-            latest_s = max(
-                latest_s, float(off_s[0]) - flight.fault.begin_s if len(off_s) else math.inf
-            )
-        return Figure("motors off", latest_s, self.within_s, "s")
+    def measure(self, part: Part) -> float:
+        return part.first_s(~part.track.armed)
 
 
-@dataclass(frozen=True, slots=True)
-class KeepsHeight:
-    """As long as it flies offboard it is not further from its height at the fault than that."""
+class KeepsHeight(Bound, name="leaves its height", unit="m"):
+    """In offboard flight the vehicle keeps its height of the fault's begin."""
 
-    within_m: float
-    until_s: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        farthest_m = 0.0
-        for part in _parts(flight, self.whose, until_s=self.until_s):
-            heights_m = part.position_m[part.is_in(Px4Mode.OFFBOARD), 2]
-            if len(heights_m):
-                farthest_m = max(farthest_m, float(np.abs(heights_m - heights_m[0]).max()))
-        return Figure("leaves its height", farthest_m, self.within_m, "m")
+    def measure(self, part: Part) -> float:
+        heights_m = part.heights_m[part.flies_offboard]
+        return float(np.abs(heights_m - heights_m[:1]).max(initial=0.0))
 
 
-@dataclass(frozen=True, slots=True)
-class Climbs:
-    """Wherever it has got to, it climbs no further than that again."""
+class Climbs(Bound, name="climbs again", unit="m"):
+    """The vehicle never climbs by more than that above its lowest height."""
 
-    at_most_m: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        farthest_m = 0.0
-        for part in _parts(flight, self.whose):
-            heights_m = part.position_m[:, 2]
-            climbed_m = heights_m - np.minimum.accumulate(heights_m)
-            farthest_m = max(farthest_m, float(climbed_m.max(initial=0.0)))
-        return Figure("climbs again", farthest_m, self.at_most_m, "m")
+    def measure(self, part: Part) -> float:
+        climbed_m = part.heights_m - np.minimum.accumulate(part.heights_m)
+        return float(climbed_m.max(initial=0.0))
 
 
-@dataclass(frozen=True, slots=True)
-class NotFaster:
-    """As long as it flies offboard, no dash: it stays below that speed, in the plane."""
+class NotFaster(Bound, name="greatest speed", unit="m/s"):
+    """In offboard flight the vehicle stays below that speed, in the plane."""
 
-    speed_m_s: float
-    until_s: float
-    whose: Whose = "hit"
-
-    def figure(self, flight: FlightRecord) -> Figure:
-        fastest_m_s = 0.0
-        for part in _parts(flight, self.whose, until_s=self.until_s):
-            flown = part.velocity_m_s[part.is_in(Px4Mode.OFFBOARD) & _above(part), :2]
-            fastest_m_s = max(fastest_m_s, float(np.hypot(*flown.T).max(initial=0.0)))
-        return Figure("greatest speed", fastest_m_s, self.speed_m_s, "m/s")
+    def measure(self, part: Part) -> float:
+        flown_m_s = part.track.velocity_m_s[part.flies_offboard & _above(part.track), :2]
+        return float(np.hypot(*flown_m_s.T).max(initial=0.0))
 
 
 def judge(bounds: Sequence[Criterion], flight: FlightRecord) -> tuple[Figure, ...]:
-    """All figures, those of every flight and the fault's own."""
+    """All figures of a flight."""
     return tuple(bound.figure(flight) for bound in bounds)
 
 
-def _robots(flight: FlightRecord, whose: Whose) -> tuple[int, ...]:
+def _robots(flight: FlightRecord, group: RobotGroup) -> tuple[int, ...]:
     everybody = tuple(range(len(flight.vehicles)))
     following = tuple((robot + 1) % len(everybody) for robot in flight.fault.hit)
     others = tuple(robot for robot in everybody if robot not in flight.fault.hit)
@@ -679,7 +549,7 @@ def _robots(flight: FlightRecord, whose: Whose) -> tuple[int, ...]:
     return {
         "hit": flight.fault.hit, "next": following, "others": others, "all": everybody,
         "first half": everybody[:half], "second half": everybody[half:],
-    }[whose]  # fmt: skip
+    }[group]  # fmt: skip
 
 
 def _fence(flight: FlightRecord) -> Fence:
@@ -687,72 +557,45 @@ def _fence(flight: FlightRecord) -> Fence:
     return flight.fence
 
 
-def _parts(flight: FlightRecord, whose: Whose, *, until_s: float = math.inf) -> Iterator[TrueTrack]:
-    """Of each of them what it did from the fault on, and until then."""
-    begin_s = flight.fault.begin_s
-    return (vehicle.between(begin_s, begin_s + until_s) for vehicle in _of(flight, whose))
-
-
 def _above(vehicle: TrueTrack) -> Bools:
-    """(T,): whether it is off the ground, by its place alone."""
+    """(T,): whether the vehicle is off the ground, by its position alone."""
     above: Bools = vehicle.position_m[:, 2] > ON_GROUND_BELOW_M
     return above
 
 
 def _piloted(vehicle: TrueTrack) -> Bools:
-    """(T,): whether somebody flies it by hand."""
+    """(T,): whether a pilot flies the vehicle."""
     return vehicle.is_in(*PILOTED)
 
 
-def _of(flight: FlightRecord, whose: Whose) -> Iterator[TrueTrack]:
-    return (flight.vehicles[robot] for robot in _robots(flight, whose))
-
-
-def _unkilled(flight: FlightRecord) -> Iterator[TrueTrack]:
-    return (
-        vehicle
-        for robot, vehicle in enumerate(flight.vehicles)
-        if not flight.fault.ordered("kill", robot)
-    )
-
-
-def _since_s(flight: FlightRecord, mark: str) -> float:
-    return flight.fault.marks[mark] if mark else flight.fault.begin_s
-
-
-def _rises_s(vehicle: TrueTrack) -> list[float]:
-    rises = np.flatnonzero(vehicle.armed[1:] & ~vehicle.armed[:-1]) + 1
-    starts: list[float] = vehicle.time_s[rises].tolist()
-    return starts
+def _farthest_m(places_m: F64) -> float:
+    """Greatest distance from the first place, in the plane."""
+    offsets_m = places_m[:, :2] - places_m[:1, :2]
+    return float(np.hypot(*offsets_m.T).max(initial=0.0))
 
 
 def _spans_s(vehicle: TrueTrack, holds: Bools) -> list[tuple[float, float]]:
-    """From when to when something holds."""
+    """Begins and ends of the spans in which the condition holds."""
     steps = np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8))
     begins, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1
     times_s = vehicle.time_s
     return [(float(times_s[b]), float(times_s[e])) for b, e in zip(begins, ends, strict=True)]
 
 
-def _alone_m(flight: FlightRecord, vehicle: TrueTrack, times_s: F64) -> F64:
-    """(T,): how far the nearest other vehicle is at each time, in the plane."""
-
-    def place_m(of: TrueTrack) -> F64:
-        axes = [np.interp(times_s, of.time_s, of.position_m[:, axis]) for axis in range(2)]
-        return np.stack(axes, axis=1)
-
-    own_m = place_m(vehicle)
-    away_m = [
-        np.linalg.norm(place_m(other) - own_m, axis=1)
-        for other in flight.vehicles
-        if other is not vehicle
-    ]
-    nearest_m: F64 = np.min([np.full(len(times_s), np.inf), *away_m], axis=0)
+def _alone_m(part: Part) -> F64:
+    """(T,): distance of the nearest other vehicle, in the plane."""
+    times_s, own_m = part.track.time_s, part.track.position_m[:, :2]
+    away_m = [np.full(len(times_s), np.inf)]
+    for robot, other in enumerate(part.flight.vehicles):
+        if robot != part.robot:
+            axes = [np.interp(times_s, other.time_s, other.position_m[:, axis]) for axis in (0, 1)]
+            away_m.append(np.linalg.norm(np.stack(axes, axis=1) - own_m, axis=1))
+    nearest_m: F64 = np.min(away_m, axis=0)
     return nearest_m
 
 
-def _distances_m(one: TrueTrack, other: TrueTrack) -> F64:
-    """3-D, at all times when at least one of the two is in the air."""
+def _least_distance_m(one: TrueTrack, other: TrueTrack) -> float:
+    """Least distance in 3-D while at least one of the two is in the air; inf if never."""
     times_s = one.time_s
     if len(times_s) == len(other.time_s) and np.abs(times_s - other.time_s).max(initial=0) < 1e-6:
         first_m, second_m, second_up = one.position_m, other.position_m, _above(other)
@@ -766,5 +609,6 @@ def _distances_m(one: TrueTrack, other: TrueTrack) -> F64:
         )
         second_up = _above(other)[np.searchsorted(other.time_s, times_s)]
         one = one.between(times_s[0], times_s[-1] + _STEP_S / 2.0)
-    distances_m: F64 = np.linalg.norm(first_m - second_m, axis=1)
-    return distances_m[(_above(one)[: len(distances_m)]) | second_up]
+    distances_m = np.linalg.norm(first_m - second_m, axis=1)
+    up = _above(one)[: len(distances_m)] | second_up
+    return float(distances_m[up].min(initial=math.inf))

@@ -2,9 +2,9 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from edge.flight.margins import ErrorBudget
 from lpac.analysis.flight import FaultRecord, FlightRecord, GivenOrder
 from lpac.analysis.logs import simulated_name
 from lpac.analysis.truth import TrueTrack
+from lpac.ground.procedure import Ground
 from lpac.ground.station.protocol import (
     Request,
     Resume,
@@ -26,7 +27,6 @@ from lpac.ground.station.protocol import (
 )
 from lpac.sim.description import ERRORS
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.flight import Timeline
 from lpac.sim.drill.injections import Do, FenceWithout, Injection, OperatorOrders, OrderedKind
 from lpac.sim.fleet.layout import Layout
 from lpac.sim.px4.vector import level
@@ -41,6 +41,14 @@ EXACT = ErrorBudget(
 _ORDER_S = 10.0
 
 
+class Timeline(NamedTuple):
+    """Robots that were hit, and times of the fault and its marks, s of the vehicles' clock."""
+
+    hit: tuple[int, ...]
+    fault_s: float
+    marks: Mapping[str, float]
+
+
 class FaultyVehicle(Protocol):
     """True and estimated position of a vehicle: the world's frame, (3,), m."""
 
@@ -52,7 +60,9 @@ class FaultyVehicle(Protocol):
 
 
 class FaultyFleet(ABC):
-    """A fleet that faults are done to; `orders` are all that were given, `layout` what it is.
+    """A fleet that faults are done to, under its ground, on some kind of vehicles.
+
+    `orders` are all that were given, `layout` is what it is.
 
     It is a `Surroundings` of its vehicles.
     """
@@ -62,6 +72,24 @@ class FaultyFleet(ABC):
         self.orders: list[GivenOrder] = []
 
     # What differs between kinds of vehicles
+
+    @property
+    @abstractmethod
+    def ground(self) -> Ground:
+        """The ground that commands now."""
+
+    @property
+    @abstractmethod
+    def ground_runs(self) -> bool:
+        """Whether it does."""
+
+    @abstractmethod
+    def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
+        """Have something happen, so much later."""
+
+    @abstractmethod
+    def all_down(self) -> bool:
+        """Whether all vehicles really stand on the ground, motors off."""
 
     @abstractmethod
     def now_s(self) -> float:
@@ -218,9 +246,12 @@ def has_remote_control(fault: Fault) -> bool:
     return settings_of(fault).get("failsafe", {}).get("rc") == "pilot"
 
 
-def supports(injections: tuple[type, ...], fault: Fault) -> bool:
-    """Whether vehicles that take these injections fly a fault."""
-    return all(isinstance(do.injection, injections) for do in fault.does)
+def supports(kinds: Collection[object], fault: Fault) -> bool:
+    """Whether vehicles that take injections of these kinds fly a fault."""
+    return all(
+        type(do.injection) in kinds or getattr(do.injection, "kind", None) in kinds
+        for do in fault.does
+    )
 
 
 def _kind(request: Request) -> str:

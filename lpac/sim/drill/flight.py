@@ -5,13 +5,12 @@ field's own clock. Everything that is drawn follows from the seed and the fault'
 """
 
 import zlib
-from collections.abc import Callable, Mapping
-from typing import NamedTuple, Protocol
+from collections.abc import Mapping
 
 import numpy as np
 
 from lpac.analysis.snapshot import FleetSnapshot
-from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
+from lpac.ground.procedure import NothingComesError, Procedure, Until
 from lpac.ground.station.protocol import (
     CommandReport,
     Enable,
@@ -22,7 +21,7 @@ from lpac.ground.station.protocol import (
     Takeoff,
 )
 from lpac.sim.drill.faults import Fault, Phase
-from lpac.sim.drill.injections import Do, Injection
+from lpac.sim.drill.field import FaultyFleet, Timeline
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.scenario import Scenario
 
@@ -37,48 +36,6 @@ _HEARD_S, _READY_S = 30.0, 60.0
 _ALL_DOWN_S = 200.0
 
 
-class Field(Protocol):
-    """A fleet that faults are done to, under its ground, on some kind of vehicles."""
-
-    @property
-    def ground(self) -> Ground:
-        """The ground that commands now."""
-        ...
-
-    @property
-    def ground_runs(self) -> bool:
-        """Whether it does."""
-        ...
-
-    def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
-        """Have something happen, so much later."""
-        ...
-
-    def lead_s(self, injection: Injection) -> float:
-        """How much earlier it has to happen to be felt in time."""
-        ...
-
-    def now_s(self) -> float:
-        """The vehicles' clock."""
-        ...
-
-    def all_down(self) -> bool:
-        """Whether all vehicles really stand on the ground, motors off."""
-        ...
-
-    def noted(self, request: Request) -> Callable[[], None]:
-        """Note that something is commanded now; call the result when it is answered."""
-        ...
-
-
-class Timeline(NamedTuple):
-    """Robots that were hit, and times of the fault and its marks, s of the vehicles' clock."""
-
-    hit: tuple[int, ...]
-    fault_s: float
-    marks: Mapping[str, float]
-
-
 def drawn(fault: Fault, seed: int, robots: int) -> tuple[tuple[int, ...], float]:
     """Draw the robots to hit, and how long after its phase the fault begins, s."""
     rng = np.random.default_rng([seed, zlib.crc32(fault.name.encode())])
@@ -87,7 +44,7 @@ def drawn(fault: Fault, seed: int, robots: int) -> tuple[tuple[int, ...], float]
     return tuple(sorted(order[:hits])), float(rng.uniform(*_BEGINS_S[fault.phase]))
 
 
-def to_ready(field: Field) -> Procedure[None]:
+def to_ready(field: FaultyFleet) -> Procedure[None]:
     """All are heard, and have passed their checks."""
     yield Until(lambda told: all(robot.fresh for robot in told.robots), _HEARD_S)
     for request in (SetOrigin(ORIGIN), Enable()):
@@ -95,13 +52,13 @@ def to_ready(field: Field) -> Procedure[None]:
     yield Until(_all_ready, _READY_S)
 
 
-def to_mission(field: Field) -> Procedure[None]:
+def to_mission(field: FaultyFleet) -> Procedure[None]:
     """From there into the mission, as far as it goes: who refuses stays behind."""
     for request in (Takeoff(), Start()):
         yield from _command(field, request)
 
 
-def fly(field: Field, fault: Fault, scenario: Scenario) -> Procedure[Timeline]:
+def fly(field: FaultyFleet, fault: Fault, scenario: Scenario) -> Procedure[Timeline]:
     """From `to_ready`, or for a fault in the mission or later from `to_mission`, to the end."""
     hit, delay_s = drawn(fault, scenario.seed, scenario.robots)
     delay_s = max([delay_s, *(field.lead_s(do.injection) - do.at_s for do in fault.does)])
@@ -126,7 +83,7 @@ def fly(field: Field, fault: Fault, scenario: Scenario) -> Procedure[Timeline]:
     return Timeline(hit, fault_s, marks)
 
 
-def _command(field: Field, request: Request) -> Procedure[CommandReport | None]:
+def _command(field: FaultyFleet, request: Request) -> Procedure[CommandReport | None]:
     """Report of the command; None if there is no ground, or it does not end."""
     if not field.ground_runs:
         return None

@@ -1,13 +1,14 @@
-"""Injections: changes done to a fleet in flight. Each kind of vehicle supports some (`supports`).
+"""Injections of faults into a fleet, and their times.
 
-Those below `VehicleInjection` are done to a simulated vehicle, whoever flies it. Those below
-`PilotInjection` are what somebody with a remote control, or a ground station, does with any.
-(Who is to hover over a place by one look a second must know how a simulated vehicle answers.)
+An injection into a vehicle is a function of the vehicle, its robot and its surroundings. Called
+without these three it makes the `OnVehicle` that applies it later. All others are data.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from functools import wraps
+from typing import Any, Concatenate, Literal, ParamSpec, Protocol
 
 import numpy as np
 
@@ -21,13 +22,11 @@ from lpac.sim.px4.wire import MavlinkWire
 
 _PILOT_M_S, _PILOT_GAIN_PER_S = 3.0, 0.7
 _PILOT_ARRIVED_M, _PILOT_ABOVE_M = 1.0, 3.0
+_Arguments = ParamSpec("_Arguments")
 
 
 class Surroundings(Protocol):
-    """Where a vehicle is, for what depends on that: the world's frame, north and east, m.
-
-    Robots count on from the last to the first.
-    """
+    """Places around a vehicle, in the world's frame, north and east, m; robots count cyclically."""
 
     def outwards(self, robot: int) -> Vector:
         """In the plane: the way to the nearest line of the fence."""
@@ -50,362 +49,270 @@ class Surroundings(Protocol):
         ...
 
 
-class VehicleInjection:
-    """Something that is done to a simulated vehicle."""
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        """Do it now."""
-        raise NotImplementedError
-
-
-class PilotInjection(VehicleInjection):
-    """Something that is done by way of the vehicle's remote control, or its mode."""
-
-    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
-        """Do it now."""
-        raise NotImplementedError
-
-
 @dataclass(frozen=True, slots=True)
-class LoseGps(VehicleInjection):
-    """Its receiver sees no satellite, or sees them again."""
+class OnVehicle:
+    """An injection into a vehicle: a function `do` of this module and its arguments.
 
-    lost: bool = True
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_lost = self.lost
-
-
-@dataclass(frozen=True, slots=True)
-class BatteryIs(VehicleInjection):
-    """Its battery has this share left from now on."""
-
-    remaining: float
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.battery_remaining = self.remaining
-
-
-@dataclass(frozen=True, slots=True)
-class Drain(BatteryIs):
-    """It falls to it in flight: PX4's own simulator drains only a battery of an armed vehicle."""
-
-
-@dataclass(frozen=True, slots=True)
-class SensorDies(VehicleInjection):
-    """A driver says nothing any more."""
-
-    sensor: SimulatedSensor
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.dead_sensors.add(self.sensor)
-
-
-@dataclass(frozen=True, slots=True)
-class ReceiverReports(VehicleInjection):
-    """The receiver says that its fix is so accurate; None: what it usually says."""
-
-    accuracy_m: float | None
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_told_m = self.accuracy_m
-
-
-@dataclass(frozen=True, slots=True)
-class ReceiverJumps(VehicleInjection):
-    """The receiver's fix lies that far away from where it was, outwards."""
-
-    by_m: float
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_jump_m = times(around.outwards(robot), self.by_m)
-
-
-@dataclass(frozen=True, slots=True)
-class ReceiverSticks(VehicleInjection):
-    """The receiver repeats its last place as a fresh fix, with a velocity of 0."""
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.receiver.stuck = True
-
-
-@dataclass(frozen=True, slots=True)
-class ReceiverLies(VehicleInjection):
-    """The receiver's places walk off, its velocity is biased (both outwards), or places scatter."""
-
-    creep_m_s: float = 0.0
-    velocity_bias_m_s: float = 0.0
-    scatter_m: float = 0.0
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        outwards = around.outwards(robot)
-        vehicle.receiver.creep_m_s = times(outwards, self.creep_m_s)
-        vehicle.receiver.velocity_bias_m_s = times(outwards, self.velocity_bias_m_s)
-        vehicle.receiver.scatter_m = self.scatter_m
-
-
-@dataclass(frozen=True, slots=True)
-class EstimateFreezes(VehicleInjection):
-    """Position and velocity go on being told, and are the old ones."""
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.estimate_frozen = True
-
-
-@dataclass(frozen=True, slots=True)
-class EstimateDrifts(VehicleInjection):
-    """The estimate, and the receiver with it, walks away from the truth: inwards, and down.
-
-    So the vehicle itself is led outwards, and up.
+    `kind` is the function as the module has it. A kind of `BY_PILOTS` takes any `PilotedVehicle`,
+    others a `Px4Vehicle`.
     """
 
-    inwards_m_s: float = 0.0
-    down_m_s: float = 0.0
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        north, east, _ = times(around.outwards(robot), -self.inwards_m_s)
-        vehicle.gps_drift_m_s = north, east, self.down_m_s
-
-
-@dataclass(frozen=True, slots=True)
-class HeightJumps(VehicleInjection):
-    """The estimate of height jumps, and no new origin explains it."""
-
-    up_m: float
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_offset_m = minus(vehicle.gps_offset_m, (0.0, 0.0, self.up_m))
-
-
-@dataclass(frozen=True, slots=True)
-class EstimateJumpsOut(VehicleInjection):
-    """The estimate, and the receiver with it, is all at once that far beyond the fence's line."""
-
-    beyond_m: float
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        jump_m = times(around.outwards(robot), around.inside_m(robot) + self.beyond_m)
-        vehicle.gps_offset_m = plus(vehicle.gps_offset_m, jump_m)
-
-
-@dataclass(frozen=True, slots=True)
-class EstimateIsRight(VehicleInjection):
-    """End the estimator's error: its position jumps back."""
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_offset_m = ZERO
-
-
-@dataclass(frozen=True, slots=True)
-class OriginJumps(VehicleInjection):
-    """The estimator starts over from another origin: north, east, down."""
-
-    by_m: tuple[float, float, float]
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.jump_estimator_origin(*self.by_m)
-
-
-@dataclass(frozen=True, slots=True)
-class CompassJumps(VehicleInjection):
-    """Make the estimated heading jump."""
-
-    by_deg: float
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.compass_jump_rad = math.radians(self.by_deg)
-
-
-@dataclass(frozen=True, slots=True)
-class WindBlows(VehicleInjection):
-    """Besides the fleet's own wind, a storm outwards (0: none), and gusts (standard deviation)."""
-
-    outwards_m_s: float = 0.0
-    gusts_m_s: float = 0.0
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.wind_m_s = times(around.outwards(robot), self.outwards_m_s)
-        vehicle.gust_m_s = self.gusts_m_s
-
-
-@dataclass(frozen=True, slots=True)
-class MotorWeakens(VehicleInjection):
-    """It loses that share of its thrust."""
-
-    loss: float
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.motor_loss = self.loss
-
-
-@dataclass(frozen=True, slots=True)
-class WireIs(VehicleInjection):
-    """Faults of all MAVLink messages between computer and autopilot."""
-
-    wire: MavlinkWire
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.wire = self.wire
-
-
-@dataclass(frozen=True, slots=True)
-class RemoteControl(PilotInjection):
-    """Somebody's remote control is on and heard, or not."""
-
-    on: bool
+    kind: Callable[..., "OnVehicle"]
+    do: Callable[..., None]
+    arguments: tuple[Any, ...]
+    named: dict[str, Any]
 
     def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
-        vehicle.rc_connected = self.on
+        """Inject it now."""
+        self.do(vehicle, robot, around, *self.arguments, **self.named)
 
 
-@dataclass(frozen=True, slots=True)
-class FenceCleared(VehicleInjection):
-    """Another ground station clears PX4's fence."""
+def _on_vehicle(
+    do: Callable[Concatenate[Any, int, Surroundings, _Arguments], None],
+) -> Callable[_Arguments, OnVehicle]:
+    @wraps(do)
+    def kind(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> OnVehicle:
+        return OnVehicle(kind, do, arguments, named)
 
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.fence = ()
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterIs(VehicleInjection):
-    """One of PX4's own parameters has this value, set by another ground station."""
-
-    name: str
-    value: float
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.parameters[self.name] = self.value
+    return kind
 
 
-@dataclass(frozen=True, slots=True)
-class ModeIs(PilotInjection):
-    """A ground station asks for a mode of PX4."""
-
-    mode: Px4Mode
-
-    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
-        vehicle.set_mode(self.mode)
+@_on_vehicle
+def lose_gps(vehicle: Px4Vehicle, _: int, around: Surroundings, *, lost: bool = True) -> None:
+    """Take all satellites from the receiver, or give them back."""
+    vehicle.gps_lost = lost
 
 
-@dataclass(frozen=True, slots=True)
-class PilotFlies(PilotInjection):
-    """A pilot takes it by remote control, and flies it outwards and up at these speeds."""
-
-    outwards_m_s: float = 0.0
-    up_m_s: float = 0.0
-
-    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
-        north, east, _ = times(around.outwards(robot), self.outwards_m_s)
-        vehicle.pilot(Px4Mode.POSCTL, (north, east, -self.up_m_s))
+@_on_vehicle
+def change_battery(vehicle: Px4Vehicle, _: int, around: Surroundings, remaining: float) -> None:
+    """Set the remaining share of the battery."""
+    vehicle.battery_remaining = remaining
 
 
-@dataclass(frozen=True, slots=True)
-class PilotLands(PilotInjection):
-    """The pilot who has it lands it."""
-
-    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
-        vehicle.move_sticks(())
-        vehicle.set_mode(Px4Mode.LAND)
+@_on_vehicle
+def drain(vehicle: Px4Vehicle, _: int, around: Surroundings, remaining: float) -> None:
+    """Drain the battery to that share in flight: PX4's own simulator drains none while disarmed."""
+    vehicle.battery_remaining = remaining
 
 
-@dataclass(frozen=True, slots=True)
-class CarriedToPad(VehicleInjection):
-    """Somebody carries it to another robot's pad, or beside it: on the ground, motors off.
+@_on_vehicle
+def silence(vehicle: Px4Vehicle, _: int, around: Surroundings, sensor: SimulatedSensor) -> None:
+    """Silence a sensor's driver."""
+    vehicle.dead_sensors.add(sensor)
 
-    `to_pad` is how many robots on that one is.
+
+@_on_vehicle
+def report_accuracy(vehicle: Px4Vehicle, _: int, around: Surroundings, accuracy_m: float) -> None:
+    """Have the receiver report that accuracy."""
+    vehicle.gps_told_m = accuracy_m
+
+
+@_on_vehicle
+def jump_fix(vehicle: Px4Vehicle, robot: int, around: Surroundings, by_m: float) -> None:
+    """Displace the receiver's fix outwards."""
+    vehicle.gps_jump_m = times(around.outwards(robot), by_m)
+
+
+@_on_vehicle
+def repeat_fix(vehicle: Px4Vehicle, _: int, around: Surroundings) -> None:
+    """Have the receiver repeat its last fix as a fresh one, with velocity 0."""
+    vehicle.receiver.stuck = True
+
+
+@_on_vehicle
+def falsify_fixes(
+    vehicle: Px4Vehicle, robot: int, around: Surroundings, *,
+    creep_m_s: float = 0.0, velocity_bias_m_s: float = 0.0, scatter_m: float = 0.0,
+) -> None:  # fmt: skip
+    """Let fixes walk away, bias their velocity (both outwards), or scatter them."""
+    outwards = around.outwards(robot)
+    vehicle.receiver.creep_m_s = times(outwards, creep_m_s)
+    vehicle.receiver.velocity_bias_m_s = times(outwards, velocity_bias_m_s)
+    vehicle.receiver.scatter_m = scatter_m
+
+
+@_on_vehicle
+def freeze_estimate(vehicle: Px4Vehicle, _: int, around: Surroundings) -> None:
+    """Freeze estimated position and velocity, which PX4 goes on sending."""
+    vehicle.estimate_frozen = True
+
+
+@_on_vehicle
+def drift_estimate(
+    vehicle: Px4Vehicle, robot: int, around: Surroundings, *,
+    inwards_m_s: float = 0.0, down_m_s: float = 0.0,
+) -> None:  # fmt: skip
+    """Let estimate and receiver walk away from the truth, inwards and down.
+
+    That leads the vehicle outwards and up.
     """
+    north, east, _ = times(around.outwards(robot), -inwards_m_s)
+    vehicle.gps_drift_m_s = north, east, down_m_s
 
-    to_pad: int = 1
-    beside_m: float = 0.0
 
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        if not vehicle.armed:
-            north_m, east_m = around.place_m(robot + self.to_pad).tolist()
-            vehicle.position_m = np.array([north_m + self.beside_m, east_m, 0.0])
+@_on_vehicle
+def jump_height(vehicle: Px4Vehicle, _: int, around: Surroundings, up_m: float) -> None:
+    """Let the estimated height jump, without a new origin."""
+    vehicle.gps_offset_m = minus(vehicle.gps_offset_m, (0.0, 0.0, up_m))
+
+
+@_on_vehicle
+def jump_outside(vehicle: Px4Vehicle, robot: int, around: Surroundings, beyond_m: float) -> None:
+    """Let estimate and receiver jump to that distance beyond the fence."""
+    jump_m = times(around.outwards(robot), around.inside_m(robot) + beyond_m)
+    vehicle.gps_offset_m = plus(vehicle.gps_offset_m, jump_m)
+
+
+@_on_vehicle
+def correct_estimate(vehicle: Px4Vehicle, _: int, around: Surroundings) -> None:
+    """End the error of the estimate: the position jumps back."""
+    vehicle.gps_offset_m = ZERO
+
+
+@_on_vehicle
+def jump_origin(
+    vehicle: Px4Vehicle, _: int, around: Surroundings, north_m: float, east_m: float, down_m: float
+) -> None:
+    """Restart the estimator from another origin."""
+    vehicle.jump_estimator_origin(north_m, east_m, down_m)
+
+
+@_on_vehicle
+def jump_heading(vehicle: Px4Vehicle, _: int, around: Surroundings, by_deg: float) -> None:
+    """Let the estimated heading jump."""
+    vehicle.compass_jump_rad = math.radians(by_deg)
+
+
+@_on_vehicle
+def blow(
+    vehicle: Px4Vehicle, robot: int, around: Surroundings, outwards_m_s: float = 0.0,
+    gusts_m_s: float = 0.0,
+) -> None:  # fmt: skip
+    """Add a storm outwards and gusts (standard deviation) to the fleet's own wind."""
+    vehicle.wind_m_s = times(around.outwards(robot), outwards_m_s)
+    vehicle.gust_m_s = gusts_m_s
+
+
+@_on_vehicle
+def weaken_motors(vehicle: Px4Vehicle, _: int, around: Surroundings, loss: float) -> None:
+    """Take that share of the thrust."""
+    vehicle.motor_loss = loss
+
+
+@_on_vehicle
+def disturb_wire(vehicle: Px4Vehicle, _: int, around: Surroundings, wire: MavlinkWire) -> None:
+    """Set the faults of MAVLink messages between computer and autopilot."""
+    vehicle.wire = wire
+
+
+@_on_vehicle
+def clear_fence(vehicle: Px4Vehicle, _: int, around: Surroundings) -> None:
+    """Clear PX4's fence, as another ground station would."""
+    vehicle.fence = ()
+
+
+@_on_vehicle
+def set_parameter(
+    vehicle: Px4Vehicle, _: int, around: Surroundings, name: str, value: float
+) -> None:
+    """Set a parameter of PX4, as another ground station would."""
+    vehicle.parameters[name] = value
+
+
+@_on_vehicle
+def carry_to_pad(
+    vehicle: Px4Vehicle, robot: int, around: Surroundings, to_pad: int = 1, beside_m: float = 0.0
+) -> None:
+    """Carry a disarmed vehicle to the pad of the robot `to_pad` further on, or beside it."""
+    if not vehicle.armed:
+        north_m, east_m = around.place_m(robot + to_pad).tolist()
+        vehicle.position_m = np.array([north_m + beside_m, east_m, 0.0])
+
+
+@_on_vehicle
+def pilot_flies_over(vehicle: Px4Vehicle, robot: int, around: Surroundings, pad: int = 1) -> None:
+    """Fly it by pilot over the pad of the robot `pad` further on, at its height, for a second."""
+    pad_m, height_m = around.place_m(robot + pad), around.height_m(robot + pad)
+    # Over everybody's heads on the way there.
+    if math.dist(vehicle.position_m[:2], pad_m) > _PILOT_ARRIVED_M:
+        height_m = around.highest_m() + _PILOT_ABOVE_M
+    target_m = np.array([*pad_m, -height_m])
+    wanted_m_s = _PILOT_GAIN_PER_S * (target_m - vehicle.position_m)
+    fastest = max(1.0, float(np.linalg.norm(wanted_m_s)) / _PILOT_M_S)
+    if vehicle.mode is not Px4Mode.POSCTL:
+        vehicle.pilot(Px4Mode.POSCTL)
+    vehicle.move_sticks((wanted_m_s / fastest).tolist())
+
+
+@_on_vehicle
+def lose_remote_control(vehicle: PilotedVehicle, _: int, around: Surroundings) -> None:
+    """Switch the remote control off."""
+    vehicle.rc_connected = False
+
+
+@_on_vehicle
+def set_mode(vehicle: PilotedVehicle, _: int, around: Surroundings, mode: Px4Mode) -> None:
+    """Ask PX4 for a mode, as a ground station would."""
+    vehicle.set_mode(mode)
+
+
+@_on_vehicle
+def pilot_flies(
+    vehicle: PilotedVehicle, robot: int, around: Surroundings, outwards_m_s: float = 0.0,
+    up_m_s: float = 0.0,
+) -> None:  # fmt: skip
+    """Take it by remote control, and fly outwards and up at these speeds."""
+    north, east, _ = times(around.outwards(robot), outwards_m_s)
+    vehicle.pilot(Px4Mode.POSCTL, (north, east, -up_m_s))
+
+
+@_on_vehicle
+def pilot_lands(vehicle: PilotedVehicle, _: int, around: Surroundings) -> None:
+    """Land it by remote control."""
+    vehicle.move_sticks(())
+    vehicle.set_mode(Px4Mode.LAND)
+
+
+BY_PILOTS = (lose_remote_control, set_mode, pilot_flies, pilot_lands)
 
 
 @dataclass(frozen=True, slots=True)
-class PilotFliesOver(VehicleInjection):
-    """A pilot flies it over a robot's pad, at that robot's height; for one second.
+class RobotProgram:
+    """A robot's program dies (kill -9, no power), ends (SIGTERM), starts again, or is unwatched."""
 
-    `pad` is how many robots on that one is.
-    """
-
-    pad: int = 1
-
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        pad_m, height_m = around.place_m(robot + self.pad), around.height_m(robot + self.pad)
-        # Over everybody's heads on the way there.
-        if math.dist(vehicle.position_m[:2], pad_m) > _PILOT_ARRIVED_M:
-            height_m = around.highest_m() + _PILOT_ABOVE_M
-        target_m = np.array([*pad_m, -height_m])
-        wanted_m_s = _PILOT_GAIN_PER_S * (target_m - vehicle.position_m)
-        fastest = max(1.0, float(np.linalg.norm(wanted_m_s)) / _PILOT_M_S)
-        if vehicle.mode is not Px4Mode.POSCTL:
-            vehicle.pilot(Px4Mode.POSCTL)
-        vehicle.move_sticks((wanted_m_s / fastest).tolist())
-
-
-# What is done to programs, to the radio and to the ground
-
-
-@dataclass(frozen=True, slots=True)
-class ProgramDies:
-    """Like kill -9, or a computer that loses its power."""
-
-
-@dataclass(frozen=True, slots=True)
-class ProgramEnds:
-    """It is told to end (SIGTERM), as `systemctl stop` does."""
-
-
-@dataclass(frozen=True, slots=True)
-class ProgramStarts:
-    """It starts again."""
+    event: Literal["dies", "ends", "starts", "loses its watchdog"]
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramStops:
-    """All of it stands still for so long, as by SIGSTOP and SIGCONT."""
+    """The whole program stops for a time, as by SIGSTOP and SIGCONT."""
 
     for_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class LoopHangs:
-    """One of its loops stands still for so long: control, perception, policy, preflight, status."""
+    """One loop of a program hangs for a time."""
 
     loop: Literal["control", "perception", "policy", "preflight", "status"]
     for_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class WatchdogDies:
-    """The process that watches the program is gone."""
-
-
-@dataclass(frozen=True, slots=True)
 class DiskFills:
-    """Nothing more can be written."""
+    """The robot's disk is full."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockSteps:
-    """The wall clock of its computer steps."""
-
-    by_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class GroundClockSteps:
-    """The wall clock of the operator's laptop steps."""
+    """The wall clock of the robot's computer steps."""
 
     by_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class SecondProgram:
-    """Another computer says that it is this robot, with a vehicle of its own."""
+    """Another computer claims to be this robot, with a vehicle of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -432,40 +339,31 @@ class RadioCut:
 
 
 @dataclass(frozen=True, slots=True)
+class Laptop:
+    """The operator's laptop dies or starts again."""
+
+    event: Literal["dies", "starts"]
+
+
+@dataclass(frozen=True, slots=True)
 class GroundStops:
-    """The ground's program stands still for so long, as a laptop that sleeps."""
+    """The ground's program stops for a time, as on a laptop that sleeps."""
 
     for_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class GroundDies:
-    """Like a laptop whose battery is empty."""
+class GroundClockSteps:
+    """The wall clock of the operator's laptop steps."""
+
+    by_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class GroundStarts:
-    """It starts again on the same laptop."""
+class SecondLaptop:
+    """A second operator's laptop joins without command, holds all, takes command, or dies."""
 
-
-@dataclass(frozen=True, slots=True)
-class SecondGroundJoins:
-    """Another operator's laptop is on the radio from now on, and commands nothing."""
-
-
-@dataclass(frozen=True, slots=True)
-class SecondGroundHolds:
-    """That other operator holds all robots."""
-
-
-@dataclass(frozen=True, slots=True)
-class SecondGroundTakesCommand:
-    """That other operator commands the fleet from now on."""
-
-
-@dataclass(frozen=True, slots=True)
-class SecondGroundDies:
-    """That other operator's laptop is gone."""
+    event: Literal["joins", "holds all", "takes command", "dies"]
 
 
 OrderedKind = Literal[
@@ -475,34 +373,31 @@ OrderedKind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class OperatorOrders:
-    """The operator commands something of the robots meant, and does not wait for the answer."""
+    """The operator commands robots, and does not wait for the answer."""
 
     kind: OrderedKind
 
 
 @dataclass(frozen=True, slots=True)
 class FenceWithout:
-    """The operator sets a fence that the landing point of a robot lies outside of."""
+    """The operator sets a fence that leaves the landing points of robots outside."""
 
 
 Injection = (
-    VehicleInjection | ProgramDies | ProgramEnds | ProgramStarts | ProgramStops | LoopHangs
-    | WatchdogDies | DiskFills | ClockSteps | GroundClockSteps | SecondProgram
-    | RadioIs | RadioCut | GroundStops | GroundDies | GroundStarts | SecondGroundJoins
-    | SecondGroundHolds | SecondGroundTakesCommand | SecondGroundDies | OperatorOrders
-    | FenceWithout
+    OnVehicle | RobotProgram | ProgramStops | LoopHangs | DiskFills | ClockSteps | SecondProgram
+    | RadioIs | RadioCut | Laptop | GroundStops | GroundClockSteps | SecondLaptop
+    | OperatorOrders | FenceWithout
 )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Do:
-    """Something happens `at_s` after the fault's begin, to those that it hits, to all, or others.
+    """An injection `at_s` after the fault's begin, into a group of robots.
 
-    A `mark` names the time, for bounds that count from it. What is done to ground or radio is done
-    once.
+    A `mark` names the time for bounds. An injection into ground or radio happens once.
     """
 
-    at_s: float
     injection: Injection
+    at_s: float = 0.0
     to: Literal["hit", "all", "others", "next"] = "hit"
     mark: str = ""

@@ -16,65 +16,54 @@ from functools import partial
 from types import TracebackType
 from typing import Self, TypeVar
 
-from pymavlink.dialects.v20 import common as mavlink
-
 from edge.robot.config import Rates, load_config
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until, carry_out
 from lpac.ground.station.client import GroundError
 from lpac.ground.station.protocol import CommandReport, Request
+from lpac.sim.drill import injections
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.field import FaultyFleet, has_remote_control
-from lpac.sim.drill.flight import Timeline, fly, to_mission, to_ready
+from lpac.sim.drill.field import FaultyFleet, Timeline, has_remote_control
+from lpac.sim.drill.flight import fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
-    BatteryIs,
+    BY_PILOTS,
     Do,
-    Drain,
-    FenceCleared,
     FenceWithout,
-    GroundDies,
-    GroundStarts,
     GroundStops,
     Injection,
-    LoseGps,
-    MotorWeakens,
+    Laptop,
+    OnVehicle,
     OperatorOrders,
-    OriginJumps,
-    ParameterIs,
-    PilotInjection,
-    ProgramDies,
-    ProgramEnds,
-    ProgramStarts,
     ProgramStops,
-    VehicleInjection,
-    WatchdogDies,
+    RobotProgram,
 )
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError, track_of
-from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import Px4Build
 from lpac.sim.sitl.ground_station import RealVehicle, RealVehicles
 
 # What is done to programs, and what their operator does, on whatever vehicles.
-_PROGRAMS = (
-    ProgramDies, ProgramEnds, ProgramStops, ProgramStarts, WatchdogDies, GroundDies, GroundStops,
-    GroundStarts, OperatorOrders, FenceWithout,
-)  # fmt: skip
+_PROGRAMS = (RobotProgram, ProgramStops, Laptop, GroundStops, OperatorOrders, FenceWithout)
 # Nobody cuts this machine's own network, fills its disk or steps its clock, and no loop of a
 # program that is as in the field hangs on demand.
-MAVLINK: tuple[type, ...] = (VehicleInjection, *_PROGRAMS)
-# What a ground station or a pilot can do to a real one, and PX4's own simulator to its vehicle.
-PX4: tuple[type, ...] = (
-    LoseGps, BatteryIs, OriginJumps, MotorWeakens, ParameterIs, FenceCleared, PilotInjection,
-    *_PROGRAMS,
-)  # fmt: skip
+MAVLINK: tuple[object, ...] = (OnVehicle, *_PROGRAMS)
+# What a ground station can do to a real one, and PX4's own simulator to its vehicle.
+_ON_REAL: dict[object, Callable[..., None]] = {
+    injections.lose_gps: RealVehicle.lose_gps,
+    injections.drain: RealVehicle.drain,
+    injections.change_battery: RealVehicle.change_battery,
+    injections.set_parameter: RealVehicle.set_parameter,
+    injections.clear_fence: RealVehicle.clear_fence,
+    injections.jump_origin: RealVehicle.jump_estimator_origin,
+    injections.weaken_motors: RealVehicle.weaken_motors,
+}
+PX4: tuple[object, ...] = (*_ON_REAL, *BY_PILOTS, *_PROGRAMS)
 
-_INT32, _REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 # How long a command may take, each robot.
 _PATIENCE_S = 60.0
 # A vehicle steps every 0.02 s; after as long without a step somebody looks all the same.
@@ -89,7 +78,7 @@ T = TypeVar("T")
 
 
 class ProcessField(FaultyFleet):
-    """A fleet of processes as a `Field` of the drill; a context, within those of its parts.
+    """A fleet of processes, and what is done to it; a context, within those of its parts.
 
     What is due is done by a thread of its own, on the vehicles' clock.
     """
@@ -135,11 +124,9 @@ class ProcessField(FaultyFleet):
 
     @property
     def ground_runs(self) -> bool:
-        """Whether it does."""
         return self._ground.running
 
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
-        """Have something happen, so much later."""
         self._at(self.now_s() + after_s, partial(self.happen, do, hit))
 
     def carry_out(self, procedure: Procedure[T]) -> T:
@@ -175,15 +162,14 @@ class ProcessField(FaultyFleet):
         return self.ground_runs
 
     def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
-        """Now."""
         match injection:
-            case VehicleInjection():
+            case OnVehicle():
                 with self.stepped:
                     for robot in robots:
                         self.inject_vehicle(injection, robot)
-            case GroundDies():
+            case Laptop("dies"):
                 self._ground.kill()
-            case GroundStarts():
+            case Laptop("starts"):
                 began_s = time.monotonic()
                 self._ground.start()
                 took_s = time.monotonic() - began_s
@@ -231,26 +217,22 @@ class ProcessField(FaultyFleet):
         return max(late_s)
 
     @abstractmethod
-    def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
+    def inject_vehicle(self, injection: OnVehicle, robot: int) -> None:
         """Now, while `stepped` is held."""
 
     @abstractmethod
     def vehicles_late_s(self, began_s: float) -> float:
         """How long the vehicles stood still since then (`time.monotonic()`)."""
 
-    @abstractmethod
-    def all_down(self) -> bool:
-        """Whether all vehicles really stand on the ground, motors off."""
-
     def _inject_program(self, injection: Injection, index: int) -> None:
         robot = self.fleet.robots[index]
         self._stopped.add(index)
         match injection:
-            case ProgramDies():
+            case RobotProgram("dies"):
                 robot.send_signal(signal.SIGKILL)
-            case ProgramEnds():
+            case RobotProgram("ends"):
                 robot.send_signal(signal.SIGTERM)
-            case ProgramStarts():
+            case RobotProgram("starts"):
                 # What restarts a program that hangs kills it first.
                 robot.send_signal(signal.SIGKILL)
                 robot.wait(_KILLED_S)
@@ -258,7 +240,7 @@ class ProcessField(FaultyFleet):
             case ProgramStops(for_s):
                 robot.send_signal(signal.SIGSTOP)
                 self._at(self.now_s() + for_s, partial(robot.send_signal, signal.SIGCONT))
-            case WatchdogDies():
+            case RobotProgram("loses its watchdog"):
                 robot.kill_watchdog()
             case _:
                 raise TypeError(f"{injection} is not done to a program")
@@ -334,7 +316,6 @@ class MavlinkField(ProcessField):
         return self._simulated.vehicles
 
     def all_down(self) -> bool:
-        """Whether all vehicles really stand on the ground, motors off."""
         with self.stepped:
             return all(
                 vehicle.landed and not vehicle.armed and vehicle.position_m[2] >= 0.0
@@ -345,12 +326,11 @@ class MavlinkField(ProcessField):
         """In all."""
         return self.fleet.lateness().vehicles_s
 
-    def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
+    def inject_vehicle(self, injection: OnVehicle, robot: int) -> None:
         """To the vehicle itself."""
         injection.apply(self.vehicles[robot], robot, self)
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """True tracks of the vehicles so far, in the world's frame."""
         with self.stepped:
             truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
         return tuple(map(track_of, truths))
@@ -366,7 +346,8 @@ class Px4Field(ProcessField):
 
     def lead_s(self, injection: Injection) -> float:
         """A battery that falls at once is told by PX4 through a filter."""
-        return _BATTERY_TOLD_S if isinstance(injection, Drain) else 0.0
+        is_drain = isinstance(injection, OnVehicle) and injection.kind is injections.drain
+        return _BATTERY_TOLD_S if is_drain else 0.0
 
     def now_s(self) -> float:
         """This machine's."""
@@ -378,7 +359,6 @@ class Px4Field(ProcessField):
         return self._px4s.vehicles
 
     def all_down(self) -> bool:
-        """Whether all vehicles really stand on the ground, motors off."""
         with self.stepped:
             return all(vehicle.landed and not vehicle.armed for vehicle in self.vehicles)
 
@@ -390,29 +370,13 @@ class Px4Field(ProcessField):
         assert isinstance(self.fleet.vehicles, Px4Build)
         return self.fleet.vehicles.stood_still_s(began_s)
 
-    def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
+    def inject_vehicle(self, injection: OnVehicle, robot: int) -> None:
         """By its ground station's link, or its pilot's remote control."""
         vehicle = self.vehicles[robot]
-        match injection:
-            case LoseGps(lost):
-                vehicle.lose_gps(lost=lost)
-            case Drain(remaining):
-                vehicle.drain(remaining)
-            case BatteryIs(remaining):
-                vehicle.change_battery(remaining)
-            case ParameterIs(name, value):
-                is_int = isinstance(PARAMETERS[name], int)
-                vehicle.set_parameter(name, value, _INT32 if is_int else _REAL32)
-            case FenceCleared():
-                vehicle.clear_fence()
-            case OriginJumps(by_m):
-                vehicle.jump_estimator_origin(*by_m)
-            case MotorWeakens(loss):
-                vehicle.weaken_motors(loss)
-            case PilotInjection():
-                injection.apply(vehicle, robot, self)
-            case _:
-                raise TypeError(f"{injection} is not done to a real PX4")
+        if injection.kind in BY_PILOTS:
+            injection.apply(vehicle, robot, self)
+        else:
+            _ON_REAL[injection.kind](vehicle, *injection.arguments, **injection.named)
 
     def tracks(self) -> tuple[TrueTrack, ...]:
         """By PX4's own logs, which are whole once it has ended.

@@ -26,24 +26,17 @@ from lpac.sim.drill.injections import (
     DiskFills,
     Do,
     GroundClockSteps,
-    GroundDies,
-    GroundStarts,
     GroundStops,
     Injection,
+    Laptop,
     LoopHangs,
-    ProgramDies,
-    ProgramEnds,
-    ProgramStarts,
+    OnVehicle,
     ProgramStops,
     RadioCut,
     RadioIs,
-    SecondGroundDies,
-    SecondGroundHolds,
-    SecondGroundJoins,
-    SecondGroundTakesCommand,
+    RobotProgram,
+    SecondLaptop,
     SecondProgram,
-    VehicleInjection,
-    WatchdogDies,
 )
 from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
@@ -57,13 +50,13 @@ _BESIDE_M = 3.0
 # The other operator.
 _SECOND = "second"
 # All that there is.
-SUPPORTED: tuple[type, ...] = get_args(Injection)
+SUPPORTED: tuple[object, ...] = get_args(Injection)
 
 T = TypeVar("T")
 
 
 class SimulatedField(FaultyFleet):
-    """A simulated fleet as a `Field` of the drill."""
+    """A simulated fleet, and what is done to it."""
 
     def __init__(self, fleet: SimulatedFleet) -> None:
         super().__init__(fleet.layout)
@@ -85,7 +78,6 @@ class SimulatedField(FaultyFleet):
 
     @property
     def ground_runs(self) -> bool:
-        """Whether it does."""
         return self.ground.runs
 
     def now_s(self) -> float:
@@ -97,11 +89,9 @@ class SimulatedField(FaultyFleet):
         return self.fleet.schedule.unix_s()
 
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
-        """Have something happen, so much later."""
         self.fleet.schedule.at(self.now_s() + after_s, partial(self.happen, do, hit))
 
     def all_down(self) -> bool:
-        """Whether all vehicles really stand on the ground, motors off."""
         return all(
             each.vehicle.landed and not each.vehicle.armed and each.vehicle.position_m[2] >= 0.0
             for each in self.fleet.vehicles
@@ -129,7 +119,6 @@ class SimulatedField(FaultyFleet):
         return dict(self.ground.setup.robots)
 
     def height_m(self, robot: int) -> float:
-        """The height that a robot flies at."""
         config = self.fleet.robots[robot % len(self.fleet.robots)].config
         return config.flight.slot_height_m
 
@@ -140,17 +129,14 @@ class SimulatedField(FaultyFleet):
         return self.ground_runs
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """True tracks of the vehicles so far, in the world's frame."""
         return tuple(track_of(vehicle.truth) for vehicle in self.vehicles)
 
     def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
-        """Now."""
         fleet = self.fleet
-        if isinstance(injection, VehicleInjection):
-            for robot in robots:
-                injection.apply(fleet.vehicles[robot].vehicle, robot, self)
-            return
         match injection:
+            case OnVehicle():
+                for robot in robots:
+                    injection.apply(fleet.vehicles[robot].vehicle, robot, self)
             case RadioIs(loss, duplication, corruption, delay_s):
                 fleet.radio.air = replace(
                     fleet.radio.air, loss=loss, duplication=duplication, corruption=corruption,
@@ -161,49 +147,44 @@ class SimulatedField(FaultyFleet):
                 fleet.radio.air = replace(fleet.radio.air, partition=partition)
             case GroundStops(for_s):
                 self.ground.suspend(for_s)
-            case GroundDies():
+            case Laptop("dies"):
                 self.ground.leave()
-            case GroundStarts():
+            case Laptop("starts"):
                 fleet.join(self._operator)
             case GroundClockSteps(by_s):
                 self.ground.clock.ahead_s += by_s
-            case SecondGroundJoins():
-                fleet.join(_SECOND)
-            case SecondGroundHolds() | SecondGroundTakesCommand() | SecondGroundDies():
-                self._inject_second_ground(injection)
+            case SecondLaptop():
+                self._inject_second_laptop(injection)
             case _:
                 for robot in robots:
                     self._inject_program(injection, robot)
 
-    def _inject_second_ground(
-        self, injection: SecondGroundHolds | SecondGroundTakesCommand | SecondGroundDies
-    ) -> None:
-        second = self.fleet.grounds[_SECOND]
-        match injection:
-            case SecondGroundHolds():
-                second.node.begin(SafetyCommand("hold"))
-            case SecondGroundTakesCommand():
-                second.node.begin(TakeCommand())
-            case SecondGroundDies():
-                second.leave()
-            case _:
-                assert_never(injection)
+    def _inject_second_laptop(self, injection: SecondLaptop) -> None:
+        match injection.event:
+            case "joins":
+                self.fleet.join(_SECOND)
+            case "holds all":
+                self.fleet.grounds[_SECOND].node.begin(SafetyCommand("hold"))
+            case "takes command":
+                self.fleet.grounds[_SECOND].node.begin(TakeCommand())
+            case "dies":
+                self.fleet.grounds[_SECOND].leave()
 
     def _inject_program(self, injection: Injection, index: int) -> None:
         robot = self.fleet.robots[index]
         match injection:
-            case ProgramDies():
+            case RobotProgram("dies"):
                 robot.stop()
-            case ProgramEnds():
+            case RobotProgram("ends"):
                 robot.end()
-            case ProgramStarts():
+            case RobotProgram("starts"):
                 robot.start()
             case ProgramStops(for_s):
                 robot.hang(for_s)
                 self.fleet.radio.suspend(index, for_s)
             case LoopHangs(loop, for_s):
                 robot.loops[loop].hang(for_s)
-            case WatchdogDies():
+            case RobotProgram("loses its watchdog"):
                 assert robot.watchdog is not None
                 robot.watchdog.die()
             case DiskFills():

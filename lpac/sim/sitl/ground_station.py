@@ -139,20 +139,20 @@ class RealVehicle:
     def lose_gps(self, *, lost: bool = True) -> None:
         """Its receiver sees no satellite from now on, or sees them again."""
         satellites = 0 if lost else _SATELLITES
-        self.set_parameter("SIM_GPS_USED", satellites, mavlink.MAV_PARAM_TYPE_INT32)
+        self.set_parameter("SIM_GPS_USED", satellites)
 
     def weaken_motors(self, loss: float) -> None:
         """Its motors lose this share of their full thrust."""
         thrust_n = (1.0 - loss) * _FULL_THRUST_N
-        self.set_parameter("SIH_T_MAX", thrust_n, mavlink.MAV_PARAM_TYPE_REAL32)
+        self.set_parameter("SIH_T_MAX", thrust_n)
 
     def drain(self, remaining: float) -> None:
         """The battery of an armed vehicle falls to this share within a second.
 
         PX4's simulator has a battery of 100 % whenever it is disarmed.
         """
-        self.set_parameter("SIM_BAT_MIN_PCT", 100.0 * remaining, mavlink.MAV_PARAM_TYPE_REAL32)
-        self.set_parameter("SIM_BAT_DRAIN", 1.0, mavlink.MAV_PARAM_TYPE_REAL32)
+        self.set_parameter("SIM_BAT_MIN_PCT", 100.0 * remaining)
+        self.set_parameter("SIM_BAT_DRAIN", 1.0)
 
     def change_battery(self, remaining: float) -> None:
         """A disarmed vehicle's battery has this share from now on.
@@ -160,7 +160,7 @@ class RealVehicle:
         It is another one, which tells PX4 itself: not for flights, since PX4 takes one that does
         not tell how long it lasts to last for no time, and returns.
         """
-        self.set_parameter("BAT1_SOURCE", _EXTERNAL_BATTERY, mavlink.MAV_PARAM_TYPE_INT32)
+        self.set_parameter("BAT1_SOURCE", _EXTERNAL_BATTERY)
         self._battery = remaining
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
@@ -174,11 +174,12 @@ class RealVehicle:
             )
         )  # fmt: skip
 
-    def set_parameter(self, name: str, value: float, kind: int) -> None:
+    def set_parameter(self, name: str, value: int | float) -> None:
         """Of PX4, again until it confirms it; an integer is sent by its bits."""
-        raw = float(np.float32(value))
-        if kind == mavlink.MAV_PARAM_TYPE_INT32:
-            raw = float(np.array([int(value)], np.int32).view(np.float32)[0])
+        raw, kind = float(np.float32(value)), mavlink.MAV_PARAM_TYPE_REAL32
+        if isinstance(value, int):
+            raw = float(np.array([value], np.int32).view(np.float32)[0])
+            kind = mavlink.MAV_PARAM_TYPE_INT32
         self._asked[name] = raw, kind
         self._parameters_due_s = 0.0
 
@@ -257,10 +258,8 @@ class RealVehicle:
         self._udp.close()
 
     def _calibrate(self) -> None:
-        for name, value in _AS_THE_STICKS_SAY.items():
-            self.set_parameter(name, value, mavlink.MAV_PARAM_TYPE_REAL32)
-        for name, number in _CHANNELS.items():
-            self.set_parameter(name, number, mavlink.MAV_PARAM_TYPE_INT32)
+        for name, value in (_AS_THE_STICKS_SAY | _CHANNELS).items():
+            self.set_parameter(name, value)
 
     def _sticks(self) -> Any:
         """Sticks of a person who looks along the vehicle's nose."""

@@ -133,9 +133,9 @@ def test_parameters_are_told_again_until_they_are_confirmed(
     vehicle, px4 = link
     now_s = 100.0
     monkeypatch.setattr("lpac.sim.sitl.ground_station.time.monotonic", lambda: now_s)
-    vehicle.set_parameter("SIM_GPS_USED", 0, mavlink.MAV_PARAM_TYPE_INT32)
-    vehicle.set_parameter("SIM_GPS_USED", 10, mavlink.MAV_PARAM_TYPE_INT32)
-    vehicle.set_parameter("MPC_VEL_MANUAL", 4.1, mavlink.MAV_PARAM_TYPE_REAL32)
+    vehicle.set_parameter("SIM_GPS_USED", 0)
+    vehicle.set_parameter("SIM_GPS_USED", 10)
+    vehicle.set_parameter("MPC_VEL_MANUAL", 4.1)
     vehicle.exchange()
     told = {each.param_id: each for each in only(px4.hear(), "PARAM_SET")}
     assert told.keys() == {"SIM_GPS_USED", "MPC_VEL_MANUAL"}

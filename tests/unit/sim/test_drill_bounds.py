@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 
 from edge.core.fence import Fence
+from edge.flight.margins import ErrorBudget
 from lpac.analysis.flight import FaultRecord, FlightRecord, GivenOrder
 from lpac.analysis.truth import TrueTrack
 from lpac.sim.drill.bounds import (
+    FALLS_M,
+    PILOT_NOTICED_S,
     POSITION_ERROR_M,
+    TOUCHDOWN_M_S,
     AllDown,
     AllKnown,
     Apart,
     BelowCeiling,
+    CarriedBeyond,
     ComesBack,
     ComesDownGently,
     Criterion,
@@ -39,13 +44,13 @@ from lpac.sim.drill.bounds import (
     NotLandedBefore,
     NoUnorderedStart,
     PilotIsAlone,
+    RobotGroup,
     SentNothing,
     Stands,
     StaysDown,
     StaysNear,
     StraightDown,
     TakesOff,
-    Whose,
     always,
 )
 from lpac.sim.drill.faults import FAULTS, Fault
@@ -127,15 +132,19 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
         WELL,
         changed(WELL, position_m=after(45.0, BESIDE_M * (1.0, 1.0, 0.0), FLOWN_M)),
     ),
-    (InsideFence(), WELL, changed(WELL, position_m=after(30.0, (-7.0, 5.0, 5.0), FLOWN_M, 31.0))),
+    (
+        InsideFence(-POSITION_ERROR_M),
+        WELL,
+        changed(WELL, position_m=after(30.0, (-7.0, 5.0, 5.0), FLOWN_M, 31.0)),
+    ),
     # The fault carries the first one, which is hit, but not the second.
     (
-        InsideFence(whose="others"),
+        InsideFence(-POSITION_ERROR_M, "others"),
         changed(WELL, position_m=after(30.0, (-20.0, 5.0, 5.0), FLOWN_M, 31.0)),
         flight_of(FIRST, replace(FIRST, position_m=FLOWN_M - (30.0, 0.0, 0.0))),
     ),
     (
-        InsideFence(25.0, "hit"),
+        CarriedBeyond(-25.0, "hit"),
         changed(WELL, position_m=after(30.0, (-20.0, 5.0, 5.0), FLOWN_M, 31.0)),
         changed(WELL, position_m=after(30.0, (-26.0, 5.0, 5.0), FLOWN_M, 31.0)),
     ),
@@ -152,10 +161,10 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
     (AllKnown(), WELL, changed(WELL, position_m=after(30.0, math.nan, FLOWN_M, 30.1))),
     (AllKnown(), WELL, changed(WELL, velocity_m_s=after(30.0, math.nan, FLOWN_M, 30.1))),
     # Its motors stop above its pad, and start again on the same order.
-    (NobodyFalls(), WELL, changed(WELL, armed=FIRST.armed & (TIMES_S < 45.0))),
+    (NobodyFalls(FALLS_M), WELL, changed(WELL, armed=FIRST.armed & (TIMES_S < 45.0))),
     (NoUnorderedStart(), WELL, changed(WELL, armed=after(8.0, False, FIRST.armed, 9.0))),
     (
-        NobodyFalls(),
+        NobodyFalls(FALLS_M),
         flight_of(
             replace(FIRST, armed=FIRST.armed & (TIMES_S < 45.0)),
             SECOND,
@@ -163,8 +172,8 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
         ),
         changed(WELL, armed=FIRST.armed & (TIMES_S < 45.0)),
     ),
-    (ComesDownGently(), WELL, changed(WELL, velocity_m_s=FIRST.velocity_m_s * 5.0)),
-    (Moves(2.0, 15.0, "hit"), WELL, STANDS_STILL),
+    (ComesDownGently(TOUCHDOWN_M_S), WELL, changed(WELL, velocity_m_s=FIRST.velocity_m_s * 5.0)),
+    (Moves(2.0, until_s=15.0), WELL, STANDS_STILL),
     (
         Holds(1.0),
         changed(WELL, mode=after(FAULT_S + 0.6, Px4Mode.HOLD, FIRST.mode)),
@@ -175,7 +184,11 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
         WELL,
         changed(WELL, position_m=after(30.0, BESIDE_M + 2.0, FLOWN_M, 30.1)),
     ),
-    (BelowCeiling(), WELL, changed(WELL, position_m=after(30.0, (5.0, 5.0, 30.0), FLOWN_M, 31.0))),
+    (
+        BelowCeiling(ErrorBudget().height_m),
+        WELL,
+        changed(WELL, position_m=after(30.0, (5.0, 5.0, 30.0), FLOWN_M, 31.0)),
+    ),
     (NoUnorderedStart(), WELL, flight_of(FIRST, SECOND, orders=())),
     (
         NoUnorderedStart(),
@@ -183,15 +196,15 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
         flight_of(FIRST, SECOND, orders=(GivenOrder("takeoff", (1,), 4.0, 12.0),)),
     ),
     (
-        PilotIsAlone(),
+        PilotIsAlone(PILOT_NOTICED_S),
         changed(WELL, mode=PILOTED, setpoint_at_s=np.minimum(FIRST.setpoint_at_s, 25.9)),
         changed(WELL, mode=PILOTED),
     ),
     (AllDown(), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed))),
     (AllDown(), WELL, changed(WELL, position_m=after(45.0, (5.0, 5.0, 3.0), FLOWN_M))),
-    (FewCommands(1.0, 20), WELL, changed(WELL, commands=FIRST.commands + after(30.0, 200, 0))),
+    (FewCommands(20), WELL, changed(WELL, commands=FIRST.commands + after(30.0, 200, 0))),
     (
-        FewCommands(10.0, 60),
+        FewCommands(60, within_s=10.0),
         changed(WELL, commands=(5.0 * TIMES_S).astype(np.int64)),
         changed(WELL, commands=(8.0 * TIMES_S).astype(np.int64)),
     ),
@@ -204,20 +217,28 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
     (NotLandedBefore(19.0), WELL, changed(WELL, mode=after(30.0, Px4Mode.LAND, FIRST.mode))),
     (Down(30.5), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed, 55.0))),
     (Down(30.5), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed))),
-    (Stands(1.0, 10.0), STANDS, changed(WELL, velocity_m_s=after(25.0, 0.9, FLOWN_M * 0.0, 26.0))),
+    (
+        Stands(from_s=1.0, until_s=10.0),
+        STANDS,
+        changed(WELL, velocity_m_s=after(25.0, 0.9, FLOWN_M * 0.0, 26.0)),
+    ),
     (
         # As fast as the estimate is wrong, it stands; faster, it does not.
-        Stands(1.0, 10.0),
+        Stands(from_s=1.0, until_s=10.0),
         changed(STANDS, velocity_m_s=DRIFTS_M_S, velocity_error_m_s=np.full_like(TIMES_S, 0.5)),
         changed(STANDS, velocity_m_s=DRIFTS_M_S, velocity_error_m_s=np.full_like(TIMES_S, 0.3)),
     ),
     (
         # It leaves the other one, which is near; with nobody near it stands.
-        Stands(1.0, 10.0, may_part=True),
+        Stands(from_s=1.0, until_s=10.0, may_part=True),
         changed(NEAR, velocity_m_s=DRIFTS_M_S),
         changed(STANDS, velocity_m_s=DRIFTS_M_S),
     ),
-    (StaysNear(1.0, 10.0, 3.0), WELL, changed(WELL, position_m=after(25.0, 9.0, FLOWN_M, 26.0))),
+    (
+        StaysNear(3.0, from_s=1.0, until_s=10.0),
+        WELL,
+        changed(WELL, position_m=after(25.0, 9.0, FLOWN_M, 26.0)),
+    ),
     (LandApart(), WELL, changed(WELL, position_m=after(45.0, (19.0, 13.5, 0.0), FLOWN_M))),
     (StraightDown(3.0), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
     (LandsAtPad(4.5), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
@@ -228,26 +249,30 @@ CASES: list[tuple[Criterion, FlightRecord, FlightRecord]] = [
         BESIDE,
     ),
     (
-        FliesOn(15.0, whose="hit"),
+        FliesOn(0.9, until_s=15.0),
         WELL,
         changed(WELL, is_velocity=after(25.0, False, FIRST.is_velocity)),
     ),
     (MissionEnds(0.2), changed(WELL, is_velocity=TIMES_S < FAULT_S), WELL),
     (FallsSilent(0.2), changed(WELL, setpoint_at_s=SILENT_S), WELL),
     (
-        SentNothing(1.0, 3.0),
+        SentNothing(from_s=1.0, until_s=3.0),
         changed(WELL, setpoint_at_s=after(FAULT_S, FAULT_S, FIRST.setpoint_at_s, 24.0)),
         WELL,
     ),
     (StaysDown(), changed(WELL, armed=np.zeros_like(FIRST.armed)), WELL),
-    (TakesOff(), WELL, changed(WELL, armed=np.zeros_like(FIRST.armed))),
+    (TakesOff(robots="all"), WELL, changed(WELL, armed=np.zeros_like(FIRST.armed))),
     (MotorsOff(1.0), changed(WELL, armed=FIRST.armed & (TIMES_S < FAULT_S + 0.5)), WELL),
     (
-        KeepsHeight(1.0, 15.0),
+        KeepsHeight(1.0, until_s=15.0),
         WELL,
         changed(WELL, position_m=after(30.0, FLOWN_M + np.array([0.0, 0.0, 2.0]), FLOWN_M, 32.0)),
     ),
-    (NotFaster(1.0, 15.0), WELL, changed(WELL, velocity_m_s=after(30.0, 1.5, FLOWN_M * 0.0, 31.0))),
+    (
+        NotFaster(1.0, until_s=15.0),
+        WELL,
+        changed(WELL, velocity_m_s=after(30.0, 1.5, FLOWN_M * 0.0, 31.0)),
+    ),
 ]
 
 
@@ -263,9 +288,9 @@ def test_a_bound_sees_what_it_is_for(
 
 def holds(fault: Fault) -> bool:
     """Whether somebody is to stand for longer than it takes until it has to land."""
-    latest_s = {b.whose: b.within_s for b in fault.bounds if isinstance(b, Lands)}
+    latest_s = {b.robots: b.limit for b in fault.bounds if isinstance(b, Lands)}
     return any(
-        isinstance(b, Stands) and b.until_s < latest_s.get(b.whose, math.inf) for b in fault.bounds
+        isinstance(b, Stands) and b.until_s < latest_s.get(b.robots, math.inf) for b in fault.bounds
     )
 
 
@@ -292,14 +317,14 @@ def test_what_is_not_known_is_broken() -> None:
 
 
 def test_who_is_not_hit_is_judged_by_the_fence_whatever_carries_the_other() -> None:
-    cases: tuple[tuple[Whose, set[str]], ...] = (("hit", {"others", "hit"}), ("all", {"all"}))
+    cases: tuple[tuple[RobotGroup, set[str]], ...] = (("hit", {"others", "hit"}), ("all", {"all"}))
     for carried, judged in cases:
         inside = [bound for bound in always(50.0, carried) if isinstance(bound, InsideFence)]
-        assert {bound.whose for bound in inside} == judged
+        assert {bound.robots for bound in inside} == judged
     assert [b for b in always(POSITION_ERROR_M, "hit") if isinstance(b, InsideFence)] == [
-        InsideFence()
+        InsideFence(-POSITION_ERROR_M)
     ]
 
 
 def test_a_window_without_a_moment_is_broken() -> None:
-    assert FliesOn(1000.0, whose="hit", from_s=999.0).figure(WELL).broken
+    assert FliesOn(0.9, from_s=999.0, until_s=1000.0).figure(WELL).broken
