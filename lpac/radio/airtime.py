@@ -19,14 +19,14 @@ JSAC 18(3), 2000), with as many contenders as wait in a queue of such a load.
 import bisect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple, get_args
 
 from msgspec import Meta
 
-from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, NonNegative, Positive, require
+from edge.core.schema import AtLeastOne, Bounded, NonNegative, Positive, require
 from edge.core.wire import PayloadType
 from edge.identity.envelope import HEAD_BYTES
 from edge.identity.group import DATAGRAM_BYTES, PART_BYTES, frames
@@ -111,9 +111,7 @@ class Traffic(Bounded):
     """Traffic of a fleet in flight; sizes are those of sealed messages, before any framing.
 
     `message_bytes` and `message_hz` are of what a robot tells its neighbours, `status_hz` of what
-    it tells the ground. `guests` are robots of other cells whose messages and cards come by wire
-    and are sent to this cell's robots too. Orders, worlds and revocations are left out: they are
-    sent at moments.
+    it tells the ground. Orders, worlds and revocations are left out: they are sent at moments.
 
     Raises ValueError that names an impossible value.
     """
@@ -122,7 +120,6 @@ class Traffic(Bounded):
     message_bytes: Positive = MESSAGE_BYTES["float16"]
     message_hz: NonNegative = MESSAGE.rate_hz
     status_hz: NonNegative = STATUS.rate_hz
-    guests: AtLeastZero = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,9 +163,9 @@ class LinkQuality(NamedTuple):
 def airtime(transport: Transport, wifi: Wifi, traffic: Traffic) -> Airtime:
     """Airtime of the fleet's traffic.
 
-    Raises ValueError for another transport, and for a mesh with guests: it ends at its channel.
+    Raises ValueError for another transport.
     """
-    _require_possible(transport, traffic)
+    require(Transport, transport, "transport")
     return _airtime(transport, wifi, traffic, traffic.robots)
 
 
@@ -185,54 +182,13 @@ def carries(
     No more than `most_robots` are tried. Raises what `airtime` does, and ValueError for a share
     that is not above 0 and finite.
     """
-    _require_possible(transport, traffic)
+    require(Transport, transport, "transport")
     require(Positive, most, "most")
 
     def total(robots: int) -> float:
         return _airtime(transport, wifi, traffic, robots).total
 
     return bisect.bisect_right(range(1, most_robots + 1), most, key=total)
-
-
-def guests_around(robots: int, *, of: int, per_m2: float, range_m: float) -> int:
-    """How many robots of others stand within `range_m` of a square cell of so many.
-
-    Of a fleet of `of` robots, `per_m2` a square metre. Raises ValueError that names an impossible
-    value.
-    """
-    if not 1 <= robots <= of:
-        raise ValueError(f"robots = {robots}: must be from 1 to {of}, the fleet's")
-    require(Positive, per_m2, "per_m2")
-    require(NonNegative, range_m, "range_m")
-    side_m = math.sqrt(robots / per_m2)
-    around = per_m2 * (4.0 * side_m * range_m + math.pi * range_m**2)
-    return min(of - robots, round(around))
-
-
-def cells(
-    transport: Transport,
-    wifi: Wifi,
-    traffic: Traffic,
-    *,
-    per_m2: float,
-    range_m: float,
-    most: float = 0.6,
-) -> int | None:
-    """Into how few equal square cells, each with a channel of its own, a fleet must be parted.
-
-    So that none takes more than `most` of its channel's time: 1 if it need not be; None if even one
-    robot takes more. A cell is sent what `guests_around` it say, and `traffic.guests` is not looked
-    at. Raises what `airtime`, `carries` and `guests_around` do.
-    """
-    require(Positive, most, "most")
-    if airtime(transport, wifi, replace(traffic, guests=0)).total <= most:
-        return 1
-    for number in range(2, traffic.robots + 1):
-        robots = math.ceil(traffic.robots / number)
-        guests = guests_around(robots, of=traffic.robots, per_m2=per_m2, range_m=range_m)
-        if airtime(transport, wifi, replace(traffic, robots=robots, guests=guests)).total <= most:
-            return number
-    return None
 
 
 def link_quality(transport: Transport, wifi: Wifi, traffic: Traffic) -> LinkQuality:
@@ -247,7 +203,7 @@ def link_quality(transport: Transport, wifi: Wifi, traffic: Traffic) -> LinkQual
 
     Raises what `airtime` does.
     """
-    _require_possible(transport, traffic)
+    require(Transport, transport, "transport")
     wait_s, load = _queue(transport, wifi, traffic)
     delivery = min(1.0, 1.0 / load.total)
     if transport == "multicast":
@@ -291,12 +247,6 @@ def _queue(transport: Transport, wifi: Wifi, traffic: Traffic) -> tuple[float, A
         else:
             high_s = wait_s
     return high_s, load_after(high_s)
-
-
-def _require_possible(transport: Transport, traffic: Traffic) -> None:
-    require(Transport, transport, "transport")
-    if transport == "mesh" and traffic.guests:
-        raise ValueError(f"guests = {traffic.guests}: must be 0 in a mesh, which has one channel")
 
 
 def _waiting(load: float) -> float:
@@ -445,7 +395,7 @@ class _Flow(NamedTuple):
     """Messages of `senders` on a topic: how often, to how many robots, and if to the ground."""
 
     topic: str
-    source: Literal["robot", "ground", "wire"]
+    source: Literal["robot", "ground"]
     senders: float
     rate_hz: float
     payload_bytes: float
@@ -454,18 +404,15 @@ class _Flow(NamedTuple):
 
 
 def _flows(traffic: Traffic, robots: int) -> tuple[_Flow, ...]:
-    others, guests = robots - 1.0, float(traffic.guests)
-    heard = others + guests
+    others = robots - 1.0
     size, hz = traffic.message_bytes, traffic.message_hz
     return (
         _Flow("message", "robot", robots, hz, size, others),
-        _Flow("status", "robot", robots, traffic.status_hz, status_bytes(1.0 + heard), 0.0, True),
+        _Flow("status", "robot", robots, traffic.status_hz, status_bytes(robots), 0.0, True),
         _Flow("explored", "robot", robots, EXPLORED.rate_hz, EXPLORED_BYTES, 0.0, True),
         _Flow("card", "robot", robots, CARD.rate_hz, CARD_BYTES, others, True),
         _Flow("state", "ground", 1.0, state_hz(robots), state_bytes(robots), robots),
         _Flow("ground card", "ground", 1.0, GROUND_CARD.rate_hz, GROUND_CARD_BYTES, robots),
-        _Flow("guests' message", "wire", guests, hz, size, robots),
-        _Flow("guests' card", "wire", guests, CARD.rate_hz, CARD_BYTES, robots),
     )
 
 

@@ -26,8 +26,6 @@ from lpac.radio.airtime import (
     Wifi,
     airtime,
     carries,
-    cells,
-    guests_around,
     link_quality,
     state_bytes,
     status_bytes,
@@ -40,8 +38,6 @@ LOSSLESS = replace(WIFI, frame_loss=0.0)
 TEN = Traffic(robots=10)
 EACH = pytest.mark.parametrize("transport", TRANSPORTS)
 INT8 = MESSAGE_BYTES["int8"]
-# The example's field.
-PLACE: dict[str, float] = {"per_m2": 10 / 32**2, "range_m": 16.0}
 
 wifis = st.builds(
     Wifi,
@@ -161,11 +157,6 @@ def test_multicast_pays_from_a_few_robots_on() -> None:
     assert total("multicast", slow, ten) < total("mesh", slow, ten)
 
 
-def test_guests_are_sent_down_only() -> None:
-    guests = airtime("multicast", LOSSLESS, replace(TEN, guests=10))
-    assert 0.0 < guests.shares["guests' message"] < guests.shares["message"]
-
-
 # Properties
 
 
@@ -245,43 +236,6 @@ def test_a_full_channel_still_carries_what_is_sent_together() -> None:
     assert quality.delay_s > 5.0 * link_quality("mesh", WIFI, TEN).delay_s
 
 
-# Cells
-
-
-def test_a_small_fleet_needs_no_cells_and_a_large_one_more_the_larger_it_is() -> None:
-    parted = [
-        cells("multicast", WIFI, Traffic(robots=n, message_bytes=INT8), **PLACE)
-        for n in (10, 100, 300, 1000)
-    ]
-    assert parted[0] == 1
-    assert parted == sorted(parted, key=lambda number: number or math.inf)
-    assert len(set(parted)) == 4
-
-
-def test_a_cell_with_its_guests_fits_and_one_larger_does_not() -> None:
-    traffic = Traffic(robots=300, message_bytes=INT8)
-    number = cells("multicast", WIFI, traffic, **PLACE)
-    assert number is not None
-    for parts, fits in ((number, True), (number - 1, False)):
-        robots = math.ceil(300 / parts)
-        guests = guests_around(robots, of=300, **PLACE)
-        cell = replace(traffic, robots=robots, guests=guests)
-        assert (total("multicast", WIFI, cell) <= 0.6) is fits
-
-
-def test_where_one_robot_is_too_many_no_cells_help() -> None:
-    slow = Wifi(data_rate_mbit_s=0.01)
-    assert cells("multicast", slow, TEN, **PLACE) is None
-    assert carries("multicast", slow, TEN) == 0
-
-
-def test_guests_stand_around_a_cell() -> None:
-    # One robot a square metre, 100 in 10 x 10 m: four strips of 10 m^2, and the corners' circle.
-    assert guests_around(100, of=1000, per_m2=1.0, range_m=1.0) == round(40 + math.pi)
-    assert guests_around(100, of=110, per_m2=1.0, range_m=1.0) == 10
-    assert guests_around(100, of=100, per_m2=1.0, range_m=1.0) == 0
-
-
 # What is impossible
 
 
@@ -309,7 +263,6 @@ def test_an_impossible_channel_is_named(name: str, value: Any, allowed: str) -> 
         ("message_bytes", 0.0, "above 0"),
         ("message_hz", math.inf, "finite"),
         ("status_hz", -2.0, "at least 0"),
-        ("guests", -1, "at least 0"),
     ],
 )
 def test_impossible_traffic_is_named(name: str, value: Any, allowed: str) -> None:
@@ -321,12 +274,8 @@ def test_impossible_questions_are_named() -> None:
     unknown: Any = "pigeon"
     with pytest.raises(ValueError, match=r"^transport = 'pigeon': allowed are 'mesh', 'multicast'"):
         airtime(unknown, WIFI, TEN)
-    with pytest.raises(ValueError, match=r"^guests = 3: must be 0 in a mesh"):
-        airtime("mesh", WIFI, replace(TEN, guests=3))
     with pytest.raises(ValueError, match=r"^most = 0\.0: must be above 0"):
         carries("mesh", WIFI, TEN, most=0.0)
-    with pytest.raises(ValueError, match=r"^robots = 11: must be from 1 to 10"):
-        guests_around(11, of=10, **PLACE)
 
 
 # The sizes are those of real messages
