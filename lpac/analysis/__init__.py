@@ -1,1 +1,1 @@
-"""From what was recorded of a flight to numbers, figures and a page."""
+"""Evaluation of recorded flights: numbers, figures and reports."""

@@ -1,8 +1,8 @@
-"""Flight logs as numpy arrays: what was recorded, topic by topic, a column for each value.
+"""Reads flight logs as numpy arrays: one column per value of each topic.
 
-A flight's record (`lpac.analysis.examination.examine`) says what robots did together, on one clock.
-Here is all that one of them wrote, as it wrote it; `edge.drivers.flight_log` has the table of
-topics.
+These are one program's messages, unchanged. A flight's record
+(`lpac.analysis.examination.examine`) combines several logs on one clock. The topics are listed in
+`edge.drivers.flight_log`.
 """
 
 import re
@@ -26,18 +26,18 @@ _NOT_FINITE = frozenset({"NaN", "Infinity", "-Infinity"})
 class Columns:
     """T messages of one topic; `columns["position_m"]` is the column of that name.
 
-    `time_s` (T,) is Unix time, s, by the clock of who wrote. Names of what lies deeper have dots:
-    "origin.heading_deg". A column is (T, ...): numbers, and lists and arrays of them that have one
-    shape, are numeric, and float with NaN where a message does not have them; texts are texts. All
-    else, and texts that a message does not have, are objects, with None there. What no message has
-    is NaN.
+    `time_s` (T,) is Unix time, s, by the writer's clock. Names of nested values have dots:
+    "origin.heading_deg". A column is (T, ...). Numbers, and lists and arrays of numbers of one
+    shape, are numeric: float with NaN if some messages do not have them. Texts are strings.
+    Everything else, and texts that some messages do not have, are objects, with None where missing.
+    A value that no message has is NaN.
     """
 
     time_s: F64
     values: Mapping[str, npt.NDArray[Any]]
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
-        """Raises KeyError that says what there is."""
+        """Raises KeyError that lists the columns."""
         try:
             return self.values[name]
         except KeyError:
@@ -45,14 +45,14 @@ class Columns:
 
 
 def log_arrays(path: Path | str, *topics: str) -> dict[str, dict[str, Columns]]:
-    """Read a log, or all logs below a folder: log's name -> topic -> its columns.
+    """Read a log, or all logs below a folder: log's name -> topic -> columns.
 
-    A log's name is its files' without their number, such as "robot-3": these are read one after
-    another. With `topics` only these are read, which is faster, and each log has all of them.
+    A log's name is its files' without their number, such as "robot-3"; these are joined in order.
+    With `topics` only these are read, which is faster, and each log has all of them.
 
-    Raises ValueError if there are no logs, FlightLogError, also a ValueError, for a file that is
-    none, OSError. In a folder such a file is left out, with a warning. So is what a damaged log
-    does not hold.
+    Raises ValueError if there are no logs, FlightLogError (a ValueError) for an invalid file,
+    OSError. In a folder, invalid files are skipped with a warning. Gaps in damaged logs also give a
+    warning.
     """
     path = Path(path)
     paths = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
@@ -71,7 +71,7 @@ def log_arrays(path: Path | str, *topics: str) -> dict[str, dict[str, Columns]]:
         except FlightLogError as error:
             if not path.is_dir():
                 raise
-            warnings.warn(f"{error}: left out", stacklevel=2)
+            warnings.warn(f"{error}: skipped", stacklevel=2)
     for gap in gaps:
         warnings.warn(str(gap), stacklevel=2)
     return {
@@ -81,28 +81,29 @@ def log_arrays(path: Path | str, *topics: str) -> dict[str, dict[str, Columns]]:
 
 
 class _Messages:
-    """Those of one topic, as they come."""
+    """Collects the messages of one topic."""
 
     def __init__(self) -> None:
         self._time_s: list[float] = []
-        # By column: which message has it, and what it says.
-        self._said: dict[str, dict[int, object]] = defaultdict(dict)
+        # Column -> index of message -> value.
+        self._rows: dict[str, dict[int, object]] = defaultdict(dict)
 
     def add(self, time_s: float, message: Mapping[str, object]) -> None:
         for name, value in _flat(message):
-            self._said[name][len(self._time_s)] = value
+            self._rows[name][len(self._time_s)] = value
         self._time_s.append(time_s)
 
     def columns(self) -> Columns:
         count = len(self._time_s)
         values = {
-            name: _column([said.get(k) for k in range(count)]) for name, said in self._said.items()
+            name: _column([rows.get(k) for k in range(count)]) for name, rows in self._rows.items()
         }
-        # What has parts in some messages, and is not there in others, is told by its parts alone.
+        # A value that is a mapping in some messages and None in others only has the mapping's
+        # columns.
         whole = {
             name
-            for name, said in self._said.items()
-            if all(value is None for value in said.values())
+            for name, rows in self._rows.items()
+            if all(value is None for value in rows.values())
         }
         whole &= {name[:k] for name in values for k, sign in enumerate(name) if sign == "."}
         return Columns(
@@ -142,7 +143,7 @@ def _column(values: list[object]) -> npt.NDArray[Any]:
 
 
 def _numbers(value: object) -> npt.NDArray[Any] | None:
-    """As an array; None if it is something else."""
+    """Convert to an array; None if the value is not numeric."""
     if isinstance(value, np.ndarray | bool | int | float):
         return np.asarray(value)
     if isinstance(value, str) and value in _NOT_FINITE:

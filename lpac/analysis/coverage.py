@@ -1,4 +1,4 @@
-"""Value of a fleet's positions: the paper's coverage cost, Lloyd's, and Voronoi cells."""
+"""Evaluates a fleet's positions: the paper's coverage cost, Lloyd's algorithm, Voronoi cells."""
 
 import math
 from typing import Protocol
@@ -13,21 +13,21 @@ from edge.messages.mission import STEERED, FlightState, RobotStatus
 from lpac.analysis.mission_tracker import MissionStatus
 from lpac.analysis.snapshot import FleetSnapshot
 
-# With the positions that are given, ten.
+# Ten with the given positions.
 _RANDOM_STARTS = 9
 _SEED = 0
-# Lloyd's algorithm runs on a raster of this many cells a side: 16 times as fast as on the policy's
-# 512, and the cost that it comes to is the same within 1e-3. Very many robots need more.
+# Side of the raster for Lloyd's algorithm, in cells: 16 times as fast as the policy's 512, with the
+# same cost within 1e-3. Large fleets need more.
 _COARSE_CELLS = 128
 _CELLS_PER_ROBOT = 16**2
-# It ends when a step gains less than this share of the cost.
+# Stop when a step improves the cost by less than this share.
 _LEAST_GAIN = 1e-5
-# Nobody flies there, and squares of more are not finite.
+# Beyond any flight. Squares of much larger numbers would overflow.
 _FURTHEST_M = 1e6
 
 
 class World(Protocol):
-    """Description of a world; `lpac.analysis.snapshot.FleetSetup` says what each value is."""
+    """Description of a world; see `lpac.analysis.snapshot.FleetSetup` for the values."""
 
     @property
     def world(self) -> str: ...
@@ -46,7 +46,7 @@ class World(Protocol):
 class Coverage:
     """Coverage of one world. Positions are (N, 2) in the mission frame, m, also outside the world.
 
-    `importance` is (world_size, world_size), indexed [x, y], and what `features` come to, if these
+    `importance` (world_size, world_size) is indexed [x, y], and rasterised from `features` if these
     are known; `size_m` is the world's side.
     """
 
@@ -60,70 +60,70 @@ class Coverage:
 
     @classmethod
     def of(cls, world: World) -> "Coverage":
-        """Raises ValueError if the world's text is no world file."""
+        """Parse a world file. Raises ValueError if the text is invalid."""
         features = parse_world(world.world, f"world {world.world_id}")
         importance = rasterize(features, world.world_size, world.truncation, world.norm)
         return cls(importance, world.env_scale, features)
 
     def cost(self, positions_m: F64) -> float:
-        """The coverage cost J of the paper in model units (see `coverage_cost`); N >= 1."""
+        """The paper's coverage cost J in model units (see `coverage_cost`); N >= 1."""
         return coverage_cost(self.importance, positions_m * self.cells_per_m)
 
     def lloyd(self, positions_m: F64) -> float:
-        """The least J of ten runs of Lloyd's algorithm, which knows the world.
+        """The least J of ten runs of Lloyd's algorithm with knowledge of the world.
 
-        From `positions_m`, and from nine random starts that are the same each time; N >= 1. Each
-        ends in a local minimum: other starts may come to less. It takes 0.5 s for 10 robots, 2 s
-        for 30.
+        Runs start from `positions_m` and from nine random sets of positions, always the same; N >=
+        1. Each ends in a local minimum, so other starts may give less. Takes 0.5 s for 10 robots, 2
+        s for 30.
         """
         positions = positions_m * self.cells_per_m
         ends = lloyd_ends(self.importance, positions, 1 + _RANDOM_STARTS)
         return min(self.cost(each / self.cells_per_m) for each in (positions, *ends))
 
     def cells_m(self, positions_m: F64) -> list[list[tuple[float, float]]]:
-        """Each robot's Voronoi cell within the world: its corners in order, m.
+        """Corners of each robot's Voronoi cell within the world, in order, m.
 
-        A robot outside the world may have none; robots at one point share theirs.
+        A robot outside the world may have none; robots at one point share a cell.
         """
         size = (self.size_m, self.size_m)
         corners_m = (cell_corners(size, positions_m, robot) for robot in range(len(positions_m)))
         return [[(x, y) for x, y in cell.tolist()] for cell in corners_m]
 
     def density(self, size: int) -> npt.NDArray[np.uint8]:
-        """(size, size), indexed [x, y]: the importance from 0 to 255, its highest."""
+        """Importance (size, size), indexed [x, y], scaled to 0 to 255."""
         shrunk, _ = _shrink(self.importance, size)
         highest = max(float(shrunk.max()), 1e-9)
         return np.asarray(np.rint(shrunk * (255.0 / highest)), np.uint8)
 
 
 def coarse(importance: F32, robots: int) -> tuple[F32, float]:
-    """The importance in fewer cells, enough for so many robots; and how many old ones each has."""
+    """The importance in fewer cells, as needed for `robots`, and their side in old cells."""
     sides = math.ceil(math.sqrt(_CELLS_PER_ROBOT * robots))
     return _shrink(importance, max(_COARSE_CELLS, sides))
 
 
 def lloyd_ends(importance: F32, positions: F64, runs: int) -> list[F64]:
-    """Where `runs` of Lloyd's algorithm end, each (N, 2), in model units.
+    """Final positions, each (N, 2), of `runs` of Lloyd's algorithm, in model units.
 
-    It knows the world. The first starts from `positions` (N, 2), the others at random, at the same
-    places each time; without any importance there is only the first.
+    The first run starts from `positions` (N, 2), the others at random positions, the same each
+    time. Without any importance there is only the first.
     """
     shrunk, cells = coarse(importance, len(positions))
     starts = (positions / cells, *_random_starts(shrunk, len(positions), runs - 1))
     return [_lloyd(shrunk, start) * cells for start in starts]
 
 
-class Whereabouts:
-    """Tells which robots' positions count for J; it remembers where they were."""
+class LastPositions:
+    """Selects the positions that count for J; remembers last known positions."""
 
     def __init__(self) -> None:
         self._last: dict[str, tuple[float, float]] = {}
 
     def counted(self, snapshot: FleetSnapshot) -> dict[str, tuple[float, float]]:
-        """The robots that count, by name: (x, y) in the mission frame, m. Pictures come in order.
+        """Positions that count for J, by robot's name: (x, y) in the mission frame, m.
 
-        Those in the air; while nobody is, all. Who does not know where it is counts in the air
-        with where it was last, else not; who was not heard for a while never counts.
+        Call with snapshots in order. Robots in the air count; if none is, all count. A robot in the
+        air without a position counts at its last one. Stale robots never count.
         """
         flying, known = {}, {}
         for robot in snapshot.robots:
@@ -143,7 +143,7 @@ class Whereabouts:
 
 
 def in_air(status: MissionStatus) -> bool:
-    """Whether the robot flies, as far as it says."""
+    """Whether the robot reports that it flies."""
     if status.state in (FlightState.PILOT, FlightState.LAND):
         return bool(status.armed)
     return status.state in STEERED
@@ -157,7 +157,7 @@ def _position_m(status: RobotStatus) -> tuple[float, float] | None:
 
 
 def _shrink(importance: F32, most: int) -> tuple[F32, float]:
-    """(most, most): the importance in larger cells; and how many old ones a new one is long."""
+    """Importance in larger cells (most, most), and their side in old cells."""
     count = importance.shape[0]
     edges = np.linspace(0.0, count, most + 1)[:, None]
     cells = np.arange(count)
@@ -166,19 +166,19 @@ def _shrink(importance: F32, most: int) -> tuple[F32, float]:
 
 
 def _random_starts(importance: F32, robots: int, count: int) -> list[F64]:
-    """So many of positions (robots, 2), in cells, drawn from the importance."""
+    """Draw `count` sets of positions (robots, 2), in cells, with the importance as density."""
     weights = importance.ravel().astype(np.float64)
     if weights.sum() == 0.0:
         return []
     rng = np.random.default_rng(_SEED)
     drawn = rng.choice(len(weights), (count, robots), p=weights / weights.sum())
     cells = np.stack(np.unravel_index(drawn, importance.shape), axis=-1)
-    # Within the cell, since of robots at one point only one would own anything.
+    # Distributed within the cell: of robots at one point, only one would own an area.
     return list(cells + rng.random(cells.shape))
 
 
 def _lloyd(importance: F32, positions: F64) -> F64:
-    """Positions (N, 2) that a step of Lloyd's algorithm improves no more."""
+    """Local minimum (N, 2) of Lloyd's algorithm."""
     last = math.inf
     while True:
         cells = voronoi_cells(importance, positions)

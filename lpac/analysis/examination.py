@@ -1,4 +1,4 @@
-"""Examination of flight logs: a record of each mission, and notes for the reader."""
+"""Makes records of the missions in flight logs, and notes for the reader."""
 
 import contextlib
 import math
@@ -24,7 +24,7 @@ _MOST_NOTES = 3  # in one line
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """A policy's world, as `FleetSetup` has it, and the text of the one that was flown over."""
+    """A policy's world, as in `FleetSetup`, and the text of the world file of a flight."""
 
     world_size: int
     sensor_size: int
@@ -37,9 +37,9 @@ class _World:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """Scope of the report: only the missions called `missions` (none: all), snapshots at
-    `times_s` (none: at the begin, a quarter, half and all of each), over the world in `world`, for
-    the policy in `bundle`. `world_option` is what its reader gives the world by.
+    """Scope of a report: `missions` by name (none: all), with snapshots at `times_s` (none: at 0, a
+    quarter, half and all of each), over the world in `world`, for the policy in `bundle`.
+    `world_option` names the world's option in messages.
     """
 
     missions: tuple[str, ...] = ()
@@ -55,9 +55,9 @@ class Wanted:
 
 
 class Examined(NamedTuple):
-    """The missions in some logs as records, and what a reader should know of these.
+    """Records of the missions in some logs, and notes for the reader.
 
-    `without_cost` says of each mission whose cost is not known why that is.
+    `without_cost` has the reason for each mission whose cost is unknown, by name.
     """
 
     records: tuple[FlightRecord, ...]
@@ -65,7 +65,7 @@ class Examined(NamedTuple):
     without_cost: Mapping[str, str] = MappingProxyType({})
 
     def summary(self) -> dict[str, Any]:
-        """Summary as JSON values."""
+        """The records and notes as JSON values."""
         return {"trials": [_values(record) for record in self.records], "notes": list(self.notes)}
 
 
@@ -79,8 +79,8 @@ def examine(
 ) -> Examined:
     """Examine the logs below `folders`.
 
-    `progress` gets what is being done, and the share of it. Raises ValueError if there are no logs,
-    or no mission in them; OSError if something cannot be read.
+    Calls `progress` with the present step and the share that is done. Raises ValueError if there
+    are no logs or no missions in them, OSError if something cannot be read.
     """
     paths = [Path(folder) for folder in folders]
     logs = read_logs(paths, progress)
@@ -106,15 +106,13 @@ def examine(
 
 
 def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission]:
-    """Raises ValueError that says what there is."""
+    """Select missions. Raises ValueError that names the existing ones."""
     if not missions:
         robots = len(logs.statuses)
-        left_out = "".join(f"; {note}" for note in logs.notes[:_MOST_NOTES])
+        notes = "".join(f"; {note}" for note in logs.notes[:_MOST_NOTES])
         more = len(logs.notes) - _MOST_NOTES
-        left_out += f"; and {more} more such notes" if more > 0 else ""
-        raise ValueError(
-            f"no mission was flown in these logs, of {counted(robots, 'robot')}{left_out}"
-        )
+        notes += f"; and {counted(more, 'more note')}" if more > 0 else ""
+        raise ValueError(f"no mission in these logs, of {counted(robots, 'robot')}{notes}")
     if not wanted.missions:
         return missions
     names = [mission.name for mission in missions]
@@ -125,7 +123,7 @@ def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission
 
 
 class _Worlds:
-    """The worlds that can be found, by what they are called."""
+    """Finds worlds by their id."""
 
     def __init__(
         self, logs: Logs, folders: Iterable[Path], wanted: Wanted, notes: list[str]
@@ -146,19 +144,21 @@ class _Worlds:
         self._coverages: dict[_World, Coverage] = {}
 
     def of(self, mission: Mission) -> tuple[Coverage | None, int]:
-        """The world that the mission's robots flew over; None, with a note, if it is not known.
+        """The world of the mission's flight, and the width of the robots' sensor in cells.
 
-        And how many cells of it a robot's sensor saw. Raises BundleError for a given bundle that
-        cannot be loaded, or has no perception.
+        The world is None, with a note, if it is not found. Raises BundleError for a given bundle
+        that cannot be loaded or has no perception.
         """
-        said = [
-            said
+        statuses = [
+            status
             for robot in mission.robots
-            for said in self._logs.statuses[robot]
-            if mission.begin_s <= said.time_s <= mission.end_s
+            for status in self._logs.statuses[robot]
+            if mission.begin_s <= status.time_s <= mission.end_s
         ]
-        world = self._without_text(mission, {s.bundle_id for s in said})
-        return self._coverage(mission, sorted({s.world_id for s in said}), world), world.sensor_size
+        world = self._without_text(mission, {s.bundle_id for s in statuses})
+        return self._coverage(
+            mission, sorted({s.world_id for s in statuses}), world
+        ), world.sensor_size
 
     def _coverage(self, mission: Mission, flown: list[str], world: _World) -> Coverage | None:
         if len(flown) > 1:
@@ -168,14 +168,14 @@ class _Worlds:
         text = self._given
         if text is not None and id_of(text) not in flown:
             self._notes.append(
-                f"{mission.name}: {self._world_option} is {id_of(text)}, and the robots flew over "
+                f"{mission.name}: {self._world_option} is {id_of(text)}; the robots flew over "
                 f"{flown[0]}"
             )
         if text is None:
             text = self._texts.get(flown[0])
         if text is None:
             self._notes.append(
-                f"{mission.name}: world {flown[0]} is not here: no density, no cost; "
+                f"{mission.name}: no cost, because the file of world {flown[0]} is missing: "
                 f"give it with {self._world_option}"
             )
             return None
@@ -185,8 +185,8 @@ class _Worlds:
         return self._coverages[world]
 
     def _without_text(self, mission: Mission, bundle_ids: set[str]) -> _World:
-        """From the ground's log of the policies that were flown, else from a policy's bundle."""
-        setups = [told for told in self._logs.setups if told[1].bundle_id in bundle_ids]
+        """Sizes from the ground's log of the flown policies, else from a policy's bundle."""
+        setups = [setup for setup in self._logs.setups if setup[1].bundle_id in bundle_ids]
         if setups and self._bundle is None:
             before = [setup for at_s, setup in setups if at_s <= mission.end_s]
             setup = before[-1] if before else setups[0][1]
@@ -204,18 +204,18 @@ class _Worlds:
         for place in dict.fromkeys(places):
             with contextlib.suppress(BundleError, OSError):
                 bundle = load_bundle(place)
-                if bundle.id in bundle_ids:  # There may be another one by now.
+                if bundle.id in bundle_ids:  # it may have been replaced
                     return _world_of(place, bundle, env_scale)
         world = _World(512, 64, env_scale, 2.0, 1.0)
         self._notes.append(
-            f"{mission.name}: the policy's bundle is not here (give it with --bundle): assumed are "
+            f"{mission.name}: the policy's bundle is missing: give it with --bundle; assuming "
             f"a world of {world.world_size} cells and a sensor of {world.sensor_size}"
         )
         return world
 
 
 def _world_of(place: Path, bundle: Bundle, env_scale: float) -> _World:
-    """Raises BundleError if the bundle has no perception."""
+    """Sizes from a bundle. Raises BundleError if it has no perception."""
     perception, training = bundle.manifest.perception, bundle.manifest.training
     if perception is None:
         raise BundleError(f"{place}: the bundle has no perception")
@@ -226,7 +226,7 @@ def _world_of(place: Path, bundle: Bundle, env_scale: float) -> _World:
 
 
 def _fence(metadata: FlightMetadata) -> Fence | None:
-    """The configured one; None if that cannot be read."""
+    """The configured fence; None if it is invalid."""
     try:
         return from_mapping(Fence, configured(metadata, "fence"), "fence")
     except ValueError:
@@ -239,31 +239,32 @@ def _notes(logs: Logs, record: FlightRecord, wanted: Wanted) -> Iterable[str]:
         lasted = f"lasted {record.duration_s:.1f} s"
         yield f"{record.name}: {lasted}: no snapshot at {', '.join(late_s)} s"
     if len(record.cost) and not len(record.normalized):
-        yield f"{record.name}: the world holds no importance: no normalised cost"
+        yield f"{record.name}: no normalised cost, because the world has no importance"
     silent = [
         robot.name
         for robot in record.robots
-        if not {(robot.robot_id, said.boot_nonce) for said in robot.said} & logs.programs_logged
+        if not {(robot.robot_id, status.boot_nonce) for status in robot.statuses}
+        & logs.programs_logged
     ]
     if silent:
-        whose = "any robot" if len(silent) == len(record.robots) else ", ".join(silent)
+        robots = "any robot" if len(silent) == len(record.robots) else ", ".join(silent)
         yield (
-            f"{record.name}: no log of {whose} is here, only what the ground heard: which messages "
-            "arrived there is not known"
+            f"{record.name}: no log of {robots}: the messages that arrived there are unknown; the "
+            "rest is from the ground's log"
         )
-    told = record.messages
-    if told is not None and not record.clocks_known and len(told.heard_age_s):
-        low_s, high_s = told.age_quantile_s(0.0), told.age_quantile_s(0.5)
+    messages = record.messages
+    if messages is not None and not record.clocks_known and len(messages.heard_age_s):
+        low_s, high_s = messages.age_quantile_s(0.0), messages.age_quantile_s(0.5)
         if low_s < -0.05 or high_s > 2.0:
             yield (
-                f"{record.name}: the robots' clocks differ, and no ground log tells by how much: "
-                "message ages, and times between robots, are wrong"
+                f"{record.name}: message ages and times between robots are wrong: the robots' "
+                "clocks differ, and there is no ground log to correct them"
             )
 
 
 def _values(record: FlightRecord) -> dict[str, Any]:
-    """Values of a mission, as JSON."""
-    told = record.messages
+    """Numbers of a mission as JSON values."""
+    messages = record.messages
     return {
         "trial": record.name,
         "began_unix_s": round(record.begin_s, 3),
@@ -296,14 +297,14 @@ def _values(record: FlightRecord) -> dict[str, Any]:
         "alarms": [alarm._asdict() for alarm in record.alarms],
         "commands": [command._asdict() for command in record.commands],
         "messages": None
-        if told is None
+        if messages is None
         else {
-            "came": len(told.heard_at_s),
-            "lost": told.lost,
-            "rejected": told.rejected,
-            "loss_share": _number(told.loss_share),
-            "age_p50_s": _number(told.age_quantile_s(0.5)),
-            "age_p99_s": _number(told.age_quantile_s(0.99)),
+            "came": len(messages.heard_at_s),
+            "lost": messages.lost,
+            "rejected": messages.rejected,
+            "loss_share": _number(messages.loss_share),
+            "age_p50_s": _number(messages.age_quantile_s(0.5)),
+            "age_p99_s": _number(messages.age_quantile_s(0.99)),
             "ages_corrected": record.clocks_known,
         },
         "loops": {

@@ -1,10 +1,10 @@
-"""Where real vehicles were: measured from outside, or by receivers with corrections (RTK).
+"""True positions of real vehicles, measured externally or by RTK receivers.
 
-A robot takes itself to be where its autopilot does, metres beside the truth, and its virtual sensor
-looks there; so costs by the robots' own positions hide that error. What tells more is a file in the
-folder that has the robot's name, beside its logs: `truth.csv` of whatever measured it, such as
-motion capture or a video, or PX4's logs (`*.ulg`), whose fixes count while the receiver has fixed
-its carrier phases, to centimetres. The log of a PX4 in software says where its vehicle really was.
+A robot's own estimate can be metres off, and its virtual sensor is at the estimate, so costs from
+the robots' positions hide this error. Measurements lie beside the robot's logs, in the folder of
+its name: `truth.csv` from motion capture or video, or PX4's logs (`*.ulg`), whose fixes count while
+the receiver has a fixed carrier-phase solution (centimetres). The log of a PX4 in software has the
+simulated vehicle's true position.
 """
 
 import csv
@@ -22,22 +22,22 @@ from lpac.analysis.ulog import Topic, read_topics
 TRUTH_TABLE, AUTOPILOT_LOGS = "truth.csv", "*.ulg"
 _MISSION = ("unix_s", "x_m", "y_m", "height_m")
 _GLOBAL = ("unix_s", "latitude_deg", "longitude_deg", "height_m")
-# Which Unix time it was at which of PX4's own, s: `lpac sim` leaves it with the logs of its PX4s,
-# which know no time of day.
+# Unix time and PX4's time, s: written by `lpac sim` with the logs of its PX4s, which have no time
+# of day.
 CLOCK_TABLE = "clock.csv"
 _RECEIVER, _GROUND_TRUTH = "sensor_gps", "vehicle_global_position_groundtruth"
 _RTK_FIXED = 6
-# Of a vehicle that stands, or is held in a hand to be switched on, no height is above it.
+# Heights of a vehicle on the ground, or carried by hand, stay below this.
 _AIRBORNE_ABOVE_M = 0.3
-# Nothing is known between two places that are further apart.
+# Positions further apart are not interpolated.
 _GAP_S = 0.5
 
 
 class Measured(NamedTuple):
     """Measurements in one file: Unix time (T,), ascending, and places (T, 3).
 
-    x, y, m, of the mission frame, or latitude and longitude, deg, if `is_global`; and the height
-    above the ground, m.
+    Places are x, y, m, in the mission frame, or latitude and longitude, deg, if `is_global`; then
+    the height above the ground, m.
     """
 
     unix_s: F64
@@ -47,14 +47,14 @@ class Measured(NamedTuple):
 
 _NOWHERE = Measured(np.zeros(0), np.zeros((0, 3)), is_global=True)
 
-# Latitude and longitude, deg, and Unix time, s, to x and y, m, of the mission frame of that time.
+# From latitude and longitude, deg, and Unix time, s, to x and y, m, in that time's mission frame.
 ToMission = Callable[[float, float, float], tuple[float, float]]
 
 
 def read_places(path: Path) -> Measured:
-    """Read `truth.csv`, or of PX4's log the fixes that are to be trusted: often there are none.
+    """Read `truth.csv`, or the RTK fixes in a log of PX4, of which there may be none.
 
-    Raises ValueError that says what is wrong, OSError.
+    Raises ValueError that names the fault, OSError.
     """
     places = _of_table(path) if path.name == TRUTH_TABLE else _of_autopilot(path)
     if not np.isfinite(places.unix_s).all() or not np.isfinite(places.places).all():
@@ -64,14 +64,14 @@ def read_places(path: Path) -> Measured:
 
 
 def track_of(files: Iterable[Measured], to_mission: ToMission) -> TrueTrack:
-    """Join all files of one robot; where they tell nothing for a while, nothing is known."""
+    """Join all files of one robot; gaps in the measurements become NaN."""
     parts = [(file.unix_s, _in_mission(file, to_mission)) for file in files]
     time_s = np.concatenate([np.zeros(0), *(part[0] for part in parts)])
     position_m = np.concatenate([np.zeros((0, 3)), *(part[1] for part in parts)])
     order = np.argsort(time_s, kind="stable")
     time_s, position_m = time_s[order], position_m[order]
     after = np.flatnonzero(np.diff(time_s) > _GAP_S) + 1
-    # A place that is not known, just after the one and just before the other.
+    # A NaN just after the gap's begin, and another just before its end.
     gaps_s = np.stack([np.nextafter(time_s[after - 1], math.inf), time_s[after] - 1e-6], axis=1)
     time_s = np.insert(time_s, np.repeat(after, 2), gaps_s.ravel())
     position_m = np.insert(position_m, np.repeat(after, 2), np.nan, axis=0)
@@ -115,7 +115,7 @@ def _numbers(row: Sequence[str], where: str) -> list[float]:
 
 
 def _of_autopilot(path: Path) -> Measured:
-    """Heights count from the first fix: PX4 begins a log as the vehicle is armed on the ground."""
+    """Heights are relative to the first fix: PX4 starts a log when arming on the ground."""
     topics = read_topics(path, (_RECEIVER, _GROUND_TRUTH))
     if _GROUND_TRUTH in topics:
         return _of_simulator(topics[_GROUND_TRUTH], path)
@@ -137,7 +137,7 @@ def _of_autopilot(path: Path) -> Measured:
 
 
 def _of_simulator(truth: Topic, path: Path) -> Measured:
-    """Nothing where it is not known when that was."""
+    """Empty if there is no clock table."""
     clock = next((at for folder in path.parents if (at := folder / CLOCK_TABLE).is_file()), None)
     if clock is None:
         return _NOWHERE

@@ -1,4 +1,4 @@
-"""All figures of flights, from their records. Times are s from the mission's start."""
+"""Figures of flights. Times are s from the mission's start."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,8 +18,8 @@ from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness, Messages, Ro
 from lpac.analysis.style import FAINT, GREY, INK, WIDTH_IN, tidy
 
 SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a mission's duration
-# Beside a cost that rises by so much.
-_RISES = "It may rise at first: robots leave what\nthey cover, to see what nobody has seen."
+# Shown with costs that rise by at least this share.
+_RISES = "The cost may rise at first: robots\nleave covered areas to explore others."
 _RISE = 0.05
 LLOYD = "Lloyd, knowing the whole world"
 _MUCH_MS, _MUCH_LOSS = 200.0, 10.0
@@ -29,7 +29,7 @@ _HALO = [withStroke(linewidth=1.6, foreground="white")]
 
 
 def snapshots(flight: FlightRecord, times_s: Sequence[float]) -> Figure:
-    """Robots, Voronoi cells and paths so far, over the density that was seen by then."""
+    """Robots, Voronoi cells and paths at some times, over the density seen until then."""
     rows = -(-len(times_s) // 4)
     columns = -(-len(times_s) // rows)
     with style.figure(WIDTH_IN, rows * (WIDTH_IN / columns + 0.35) + 0.25) as figure:
@@ -38,7 +38,7 @@ def snapshots(flight: FlightRecord, times_s: Sequence[float]) -> Figure:
 
 
 def snapshots_of_several(flights: Mapping[str, FlightRecord], times_s: Sequence[float]) -> Figure:
-    """A row of snapshots of each flight, by its name, all of them over worlds of one size."""
+    """A row of snapshots per flight, by its name; all worlds must have one size."""
     count = len(times_s)
     with style.figure(WIDTH_IN, len(flights) * WIDTH_IN / count + 0.55) as figure:
         panels = figure.subplots(len(flights), count, squeeze=False, sharex=True, sharey=True)
@@ -55,7 +55,7 @@ def snapshots_of_several(flights: Mapping[str, FlightRecord], times_s: Sequence[
 
 
 def snapshots_and_costs(flights: Mapping[str, FlightRecord]) -> Figure:
-    """Snapshots of the first flight above the costs of all, by their names."""
+    """Snapshots of the first flight above the costs of all, by name."""
     first = next(iter(flights.values()))
     with style.figure(WIDTH_IN, 4.3) as figure:
         rows = figure.add_gridspec(2, 1, height_ratios=(1.12, 0.88))
@@ -66,16 +66,16 @@ def snapshots_and_costs(flights: Mapping[str, FlightRecord]) -> Figure:
 
 
 def draw_snapshot(axes: Axes, flight: FlightRecord, time_s: float) -> None:
-    """One of the `snapshots` into axes of yours: robots, their cells, and paths so far, in m."""
+    """Draw one of the `snapshots` into your axes: robots, their cells, and paths, in m."""
     _draw_snapshot(axes, flight, time_s)
     _frame(np.array([[axes]]), flight, margin=False)
 
 
 def draw_costs(axes: Axes, flights: Mapping[str, FlightRecord]) -> None:
-    """Normalised coverage cost over time of each flight, by its name, into axes of yours.
+    """Draw the normalised coverage cost of flights, by name, over time into your axes.
 
-    The legend, beside the axes, has the cost at the end; a layout that is "constrained" leaves room
-    for it. Records without a world are left out.
+    The legend, beside the axes, has the final costs; a "constrained" layout leaves room for it.
+    Records without a world are left out.
     """
     for index, (name, flight) in enumerate(flights.items()):
         _draw_cost(axes, flight, *style.CURVES[index % len(style.CURVES)], name)
@@ -85,7 +85,7 @@ def draw_costs(axes: Axes, flights: Mapping[str, FlightRecord]) -> None:
 
 
 def draw_states(axes: Axes, flight: FlightRecord) -> None:
-    """A bar per robot, coloured by state, into axes of yours; of points there is nothing to draw.
+    """Draw a bar per robot, coloured by state, into your axes; simulated points have no states.
 
     The legend is above the axes.
     """
@@ -98,13 +98,13 @@ def draw_states(axes: Axes, flight: FlightRecord) -> None:
 
 
 def draw_heights(axes: Axes, flight: FlightRecord) -> None:
-    """Each robot's height above its pad over time, m, into axes of yours; of points it is 0."""
+    """Draw each robot's height above its pad over time, m, into your axes; 0 for points."""
     _draw_heights(axes, flight)
     axes.set(xlabel="time since the mission began (s)", xlim=(flight.from_s, flight.to_s))
 
 
 def start_and_end(flight: FlightRecord) -> Figure:
-    """The field: where the robots were in the mission, and where they took off and landed."""
+    """Map of the flight: the robots' paths in the mission, takeoff and landing points."""
     with style.figure(6.2, 4.0) as figure:
         handles = _draw_field(figure.subplots(), flight)
         figure.legend(handles=handles, loc="outside right center")
@@ -112,7 +112,7 @@ def start_and_end(flight: FlightRecord) -> Figure:
 
 
 def overview(flight: FlightRecord) -> Figure:
-    """The field, beside states, heights and coverage cost over time."""
+    """Map of the flight, with states, heights and coverage cost over time."""
     with style.figure(WIDTH_IN, 4.7) as figure:
         columns = figure.add_gridspec(1, 2, width_ratios=(1.08, 1.0))
         left, right = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
@@ -126,7 +126,7 @@ def overview(flight: FlightRecord) -> Figure:
         )  # fmt: skip
         _draw_heights(middle, flight)
         if len(flight.normalized):
-            _draw_cost(lower, flight, style.BLACK, "-", "as they said")
+            _draw_cost(lower, flight, style.BLACK, "-", "estimated positions")
             if np.isfinite(flight.true_cost).any():
                 lower.plot(
                     flight.curve_time_s, flight.normalized_true, color=style.VERMILLION, ls="--",
@@ -141,14 +141,14 @@ def overview(flight: FlightRecord) -> Figure:
         tidy(lower)
         time_label = "time since the mission began (s)"
         if _rises(flight):
-            time_label += f"\n{_RISES.replace('It', 'The cost')}"
+            time_label += f"\n{_RISES}"
         lower.set(xlabel=time_label, xlim=(flight.from_s, flight.to_s))
         right.align_ylabels([upper, middle, lower])
         return figure
 
 
 def costs(flights: Sequence[FlightRecord]) -> Figure:
-    """Normalised coverage cost over time, beside what Lloyd's algorithm comes to, of each."""
+    """Normalised coverage cost of each flight over time, with the result of Lloyd's algorithm."""
     with style.figure(WIDTH_IN, 2.5) as figure:
         axes = figure.subplots()
         for index, flight in enumerate(flights):
@@ -160,9 +160,9 @@ def costs(flights: Sequence[FlightRecord]) -> Figure:
 
 
 def repeatability(flights: Sequence[FlightRecord]) -> Figure:
-    """All missions' cost, their mean and spread; and where the robots ended, mission by mission.
+    """Costs of all missions with mean and deviation, and the robots' end positions by mission.
 
-    Thin curves are costs where the vehicles truly were, of records that tell it.
+    Thin curves are costs from the vehicles' true positions, where recorded.
     """
     colours = style.colours_of(len(flights))
     with style.figure(WIDTH_IN, 3.1) as figure:
@@ -224,34 +224,36 @@ def states(flight: FlightRecord) -> Figure:
         return figure
 
 
-def messages(flight: FlightRecord, told: Messages) -> Figure:
-    """How old messages were, and how many did not come: pair by pair, and over time."""
+def messages(flight: FlightRecord, received: Messages) -> Figure:
+    """Ages and losses of messages, by pair of robots and over time."""
     names = [robot.name for robot in flight.robots]
     with style.figure(WIDTH_IN, 4.6) as figure:
         rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1.0))
         upper, lower = figure.add_subfigure(rows[0]), figure.add_subfigure(rows[1])
         panels = upper.subplots(1, 2)
-        age_ms, loss = 1e3 * told.age_s, 100.0 * told.loss
+        age_ms, loss = 1e3 * received.age_s, 100.0 * received.loss
         draw_matrix(upper, panels[0], age_ms, names, "median age (ms)", _MUCH_MS)
         draw_matrix(upper, panels[1], loss, names, "lost (%)", _MUCH_LOSS)
         left, right = lower.subplots(1, 2)
         edges_s = np.linspace(0.0, flight.duration_s, max(2, min(61, int(flight.duration_s) + 1)))
         middles_s = (edges_s[1:] + edges_s[:-1]) / 2.0
-        bins = np.digitize(told.heard_at_s, edges_s) - 1
+        bins = np.digitize(received.heard_at_s, edges_s) - 1
         for share, dashes, name in ((0.5, "-", "median"), (0.95, "--", "95th percentile")):
-            values = [quantile(told.heard_age_s[bins == b], share) for b in range(len(middles_s))]
+            values = [
+                quantile(received.heard_age_s[bins == b], share) for b in range(len(middles_s))
+            ]
             left.plot(middles_s, 1e3 * np.array(values), color=style.BLUE, ls=dashes, label=name)
         left.set(ylabel="message age (ms)")
         left.legend(loc="upper right", ncols=2)
-        came = np.histogram(told.heard_at_s, edges_s)[0]
-        missing = np.histogram(told.gaps[:, 0], edges_s, weights=told.gaps[:, 1])[0]
+        came = np.histogram(received.heard_at_s, edges_s)[0]
+        missing = np.histogram(received.gaps[:, 0], edges_s, weights=received.gaps[:, 1])[0]
         share_lost = 100.0 * missing / np.maximum(came + missing, 1)
         right.stairs(
             share_lost, edges_s, fill=True, color=style.VERMILLION, alpha=0.4, lw=0, zorder=2
         )
         right.stairs(share_lost, edges_s, baseline=None, color=style.VERMILLION, lw=1.4, zorder=3)
         right.set(ylabel="lost (%)")
-        # That nothing was lost is a line to be seen, too: above the axis.
+        # Keep a line at 0 visible above the axis.
         for axes, least, below in ((left, 10.0, 0.0), (right, _MUCH_LOSS, 0.05)):
             highest = max(1.25 * axes.get_ylim()[1], least)
             axes.set(
@@ -262,7 +264,7 @@ def messages(flight: FlightRecord, told: Messages) -> Figure:
 
 
 def loops(flight: FlightRecord) -> Figure:
-    """How late the loops' ticks were: over time, and robot by robot at the end."""
+    """Lateness of the loops' ticks, over time and by robot at the end."""
     with style.figure(WIDTH_IN, 3.6) as figure:
         panels = figure.subplots(2, len(LOOPS), sharey="row")
         for column, loop in enumerate(LOOPS):
@@ -335,7 +337,7 @@ def _draw_snapshot(axes: Axes, flight: FlightRecord, time_s: float) -> None:
 def _add_snapshot_legend(figure: Any, *, has_world: bool) -> None:
     handles: list[Any] = [
         _robot_handle(style.SWARM, "robot, its name"),
-        Line2D([], [], color=style.SWARM, lw=1.0, label="path so far"),
+        Line2D([], [], color=style.SWARM, lw=1.0, label="path"),
     ]
     if has_world:
         handles += _world_handles()
@@ -346,7 +348,7 @@ def _add_snapshot_legend(figure: Any, *, has_world: bool) -> None:
 
 
 def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
-    """The world as it was seen in the end, the fence, and each robot; gives the legend's."""
+    """Draw the world as seen at the end, the fence, and each robot; returns legend handles."""
     _draw_world(axes, flight, flight.duration_s)
     _draw_cells(axes, flight, flight.duration_s)
     handles: list[Any] = [_robot_handle(FAINT, "robot at the end, its name")]
@@ -363,9 +365,9 @@ def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
                     *track.position_m[0, :2], ls="", marker="s", ms=4.5, mfc="white",
                     mec=colours[robot.name], mew=1.0, zorder=4,
                 )  # fmt: skip
-        if robot.said:
+        if robot.statuses:
             axes.plot(
-                *robot.said[-1].landing_point_m, ls="", marker="x", ms=4.5,
+                *robot.statuses[-1].landing_point_m, ls="", marker="x", ms=4.5,
                 color=colours[robot.name], mew=1.2, zorder=4, path_effects=_HALO,
             )  # fmt: skip
     start_m, end_m = flight.places_at(0.0), flight.places_at(flight.duration_s)
@@ -373,8 +375,8 @@ def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
         axes.plot(*place_m, ls="", marker="o", ms=3.0, mfc="white", mec=colours[name], mew=1.0)
     _draw_robots(axes, end_m, colours)
     handles += [
-        Line2D([], [], ls="", marker="o", ms=3, mfc="white", mec=INK, label="where it began"),
-        Line2D([], [], color=INK, lw=0.9, label="path, as estimated"),
+        Line2D([], [], ls="", marker="o", ms=3, mfc="white", mec=INK, label="start"),
+        Line2D([], [], color=INK, lw=0.9, label="estimated path"),
     ]
     if flight.truth:
         handles += [
@@ -394,14 +396,14 @@ def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
 
 
 def _draw_states(axes: Axes, flight: FlightRecord) -> list[Any]:
-    """Gives the legend's."""
+    """Draw a bar per robot; returns legend handles."""
     seen: set[FlightState] = set()
     for row, robot in enumerate(flight.robots):
         for state, begin_s, end_s in robot.intervals(flight.to_s):
             seen.add(state)
             colour = style.STATE_COLOURS[state]
             axes.barh(row, end_s - begin_s, left=begin_s, height=0.8, color=colour, lw=0)
-        nonces = [said.boot_nonce for said in robot.said]
+        nonces = [status.boot_nonce for status in robot.statuses]
         for k in range(1, len(nonces)):
             if nonces[k] != nonces[k - 1]:
                 axes.plot(robot.time_s[k], row, marker="|", ms=9, color="k", mew=1.5)
@@ -412,7 +414,7 @@ def _draw_states(axes: Axes, flight: FlightRecord) -> list[Any]:
     for at_s in (0.0, flight.duration_s) if flight.duration_s else ():
         axes.axvline(at_s, color=INK, lw=0.6, ls=(0, (4, 2)))
     named = {state.value: c for state, c in style.STATE_COLOURS.items() if state in seen}
-    # States of one colour share their entry.
+    # States of one colour share an entry.
     labels = {
         colour: ", ".join(name for name, c in named.items() if c == colour)
         for colour in dict.fromkeys(named.values())
@@ -433,7 +435,7 @@ def _draw_states(axes: Axes, flight: FlightRecord) -> list[Any]:
 
 
 def _draw_heights(axes: Axes, flight: FlightRecord) -> None:
-    """In the air; each robot has its own colour, and its name at its greatest height."""
+    """Draw heights in the air; each curve ends with the robot's name."""
     for index, robot in enumerate(flight.robots):
         height_m = np.where(robot.flying, robot.position_m[:, 2], np.nan)
         axes.plot(robot.time_s, height_m, color=style.robot_colour(index), lw=0.9)
@@ -471,7 +473,7 @@ def _draw_lloyd(axes: Axes, flight: FlightRecord, colour: str = style.LLOYD) -> 
 def _frame_costs(axes: Axes, end_s: float) -> None:
     _frame_cost_axes(axes, end_s)
     if not axes.get_legend_handles_labels()[0]:
-        return  # There was nothing to cover.
+        return  # no record has a world
     axes.legend(
         loc="center left", bbox_to_anchor=(1.01, 0.5), title="$J$ at the end / $J(0)$",
         alignment="left", handlelength=2.8, fontsize=7,
@@ -487,7 +489,7 @@ def _frame_cost_axes(axes: Axes, end_s: float) -> None:
 
 
 def _draw_world(axes: Axes, flight: FlightRecord, time_s: float | None = None) -> None:
-    """The density; with a time faint where nobody had looked by then, which is outlined."""
+    """Draw the density; with a time, unseen areas are faint and the seen area is outlined."""
     coverage = flight.coverage
     if coverage is None:
         return
@@ -529,7 +531,7 @@ def _draw_robots(
     axes: Axes, places_m: Mapping[str, tuple[float, float]],
     colours: Mapping[str, str] | None = None, *, small: bool = False,
 ) -> None:  # fmt: skip
-    """Discs with the robots' names in them, or beside them if they are long."""
+    """Draw discs with the robots' names, or with long names beside them."""
     inside = all(len(name) <= _LONGEST_IN_DISC for name in places_m)
     size = (6.5 if small else 8.0) if inside else 4.5
     for name, place_m in places_m.items():
@@ -558,7 +560,7 @@ def _robot_handle(colour: str, label: str) -> Line2D:
 
 
 def _frame(panels: Any, flight: FlightRecord, *, margin: bool) -> None:
-    """Set the limits of maps: the world's, or with a margin all that was flown in."""
+    """Set the limits of maps: the world, or with a margin also the fence."""
     for axes in panels.ravel():
         axes.set_aspect("equal")
         for axis in (axes.xaxis, axes.yaxis):
@@ -583,7 +585,7 @@ def _frame(panels: Any, flight: FlightRecord, *, margin: bool) -> None:
 def draw_matrix(
     figure: Any, axes: Axes, values: F64, names: Sequence[str], label: str, much: float
 ) -> None:
-    """Values by receiver and sender; `much` has the strongest colour, unless there is more."""
+    """Draw values by receiver and sender; the strongest colour is at least at `much`."""
     highest = max(values[np.isfinite(values)].max(initial=0.0), much)
     image = axes.imshow(values, cmap=style.SCALE, vmin=0.0, vmax=highest)
     few, step = len(names) <= _MOST_NAMES, -(-len(names) // _MOST_SMALL_NAMES)

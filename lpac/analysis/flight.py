@@ -1,24 +1,23 @@
-"""One flight's record, wherever it was kept, and the numbers that follow from it.
+"""A flight's record, whatever its source, and the numbers that follow from it.
 
-Robots' logs, a ground's log, the simulators and PX4's own log are all read into a `FlightRecord`;
-what is said and drawn of a flight follows from that alone, so that `lpac sim` and `lpac report`
-say the same of one flight, to the last digit. What the numbers mean:
+Logs of robots, of a ground and of PX4, and simulators all give a `FlightRecord`, the only input of
+reports and figures: `lpac sim` and `lpac report` give identical numbers for a flight. Definitions:
 
-- The **mission** begins when its first robot says that it flies it, and ends when the last one says
-  so for the last time. Times are s from its begin, on the common clock (`lpac.analysis.logs`).
-- **J**, the coverage cost, is taken at the record's `cost_time_s`: of a fleet's flight each second,
-  and at the end. The mission's robots count that are in the air, as they say (`in_air`), where they
-  took themselves to be: on the straight line between two positions that they said, no more than
-  `FRESH_S` apart, else where they said last. Who is not heard for longer than that does not count;
-  who says that it flies, and not where, does: else the cost would jump. **True J** counts the same
-  robots where their vehicles were. Both are normalised by the first of their own.
-- The **least separation** is 3-D, of any two robots in the air; the **fence margin** the least
-  horizontal distance inside the fence in the air. They are told of where the robots took themselves
-  to be, from the mission's takeoff to its landing; and, where vehicles tell, of where all of these
-  were, from the mission before to the next.
-- A robot's **share of the mission** is the time in which it said that it flies it.
-- **Lloyd's algorithm** knows the world, and as many robots as there were begin where these began,
-  and at random places: the best that it comes to is a mark for comparison, and no bound.
+- The **mission** begins at the first status in which a robot flies it, and ends at the last one.
+  Times are s from its begin, on the common clock (`lpac.analysis.logs`).
+- **J**, the coverage cost, is evaluated at `cost_time_s`: each second of a fleet's flight, and at
+  its end. Robots of the mission count while they report to be in the air (`in_air`), at their
+  estimated positions, interpolated between two that are at most `FRESH_S` apart, else at the last
+  one. A robot without a status for longer does not count. A robot that reports to fly, but no
+  position, does, since the cost would jump. **True J** counts the same robots at their vehicles'
+  true positions. Both are normalised by their own first value.
+- The **least separation** is the 3-D distance of two robots in the air; the **fence margin** is the
+  least horizontal distance inside the fence in the air. With estimated positions, both are from the
+  mission's takeoff to its landing; with true positions, of all vehicles from the end of the mission
+  before to the begin of the next.
+- A robot's **share of the mission** is the time in which it reports to fly it.
+- **Lloyd's algorithm** knows the world. It starts with the same number of robots at their first
+  positions, and at random positions; its best result is for comparison, not a bound.
 """
 
 import itertools
@@ -58,7 +57,7 @@ class StateChange(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """A robot was in a state; s."""
+    """A time in which a robot was in a state; s."""
 
     state: FlightState
     begin_s: float
@@ -69,8 +68,8 @@ class Interval(NamedTuple):
 class RobotRecord:
     """One robot's track and statuses in a flight; a simulated point has no statuses.
 
-    `time_s` (T,), `position_m` (T, 3) in the mission frame with heights above its own pad, NaN
-    where it did not know, `flying` (T,). `said` (T,) are the statuses, if there are any.
+    `time_s` (T,), `position_m` (T, 3) in the mission frame with heights above the robot's pad, NaN
+    where unknown, `flying` (T,). `statuses` (T,) are the statuses, if there are any.
     """
 
     robot_id: int
@@ -78,13 +77,13 @@ class RobotRecord:
     time_s: F64
     position_m: F64
     flying: npt.NDArray[np.bool_]
-    said: tuple[LoggedStatus, ...] = ()
+    statuses: tuple[LoggedStatus, ...] = ()
 
     def places_at(self, times_s: F64, *, remembered: bool = False) -> F64:
-        """(len(times_s), 3): where it was in the air, m; NaN where it was not, or is not known.
+        """Positions (len(times_s), 3) in the air, m; NaN on the ground or if unknown.
 
-        Between two positions that it knew, no more than a moment apart, it is on the way. While it
-        knows none for longer it is, if that is to be `remembered`, at the last one.
+        Interpolated between known positions that are at most `FRESH_S` apart. In longer gaps a
+        position is the last one if `remembered`.
         """
         known = np.isfinite(self.position_m[:, 0])
         if not known.any():
@@ -106,20 +105,20 @@ class RobotRecord:
         return np.where(in_air[:, None], places_m, np.nan)
 
     def intervals(self, end_s: float) -> list[Interval]:
-        """Its states, one after another."""
+        """The robot's states in order."""
         found: list[Interval] = []
         begins_s = self.time_s.tolist()
         ends_s = np.minimum([*begins_s[1:], end_s], self.time_s + FRESH_S).tolist()
-        for said, begin_s, until_s in zip(self.said, begins_s, ends_s, strict=True):
-            if found and found[-1].state is said.state and found[-1].end_s >= begin_s:
+        for status, begin_s, until_s in zip(self.statuses, begins_s, ends_s, strict=True):
+            if found and found[-1].state is status.state and found[-1].end_s >= begin_s:
                 found[-1] = found[-1]._replace(end_s=until_s)
             else:
-                found.append(Interval(said.state, begin_s, until_s))
+                found.append(Interval(status.state, begin_s, until_s))
         return found
 
 
 class Separation(NamedTuple):
-    """The least distance of two robots in the air, 3-D, m."""
+    """Least 3-D distance of two robots in the air, m."""
 
     distance_m: float
     robots: tuple[str, str]
@@ -127,7 +126,7 @@ class Separation(NamedTuple):
 
 
 class CommandEntry(NamedTuple):
-    """Somebody commanded something, or a robot answered."""
+    """A command of an operator, or a robot's answer."""
 
     time_s: float
     operator: str
@@ -137,7 +136,7 @@ class CommandEntry(NamedTuple):
 
 
 class FirstAlarm(NamedTuple):
-    """A robot had an alarm, first at a time."""
+    """First occurrence of an alarm of a robot."""
 
     time_s: float
     robot: str
@@ -147,11 +146,12 @@ class FirstAlarm(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Messages:
-    """The messages between a mission's robots, while it lasted.
+    """Messages between a mission's robots, during the mission.
 
-    `age_s` and `loss` are (N, N), [receiver, sender]: the median age, and the share that did not
-    come of what was sent from the first to the last that did; NaN where nothing came. `heard` are
-    all that came: (M,) time, s, and age, s; `gaps` (G, 2) time and how many were missing before.
+    `age_s` and `loss` (N, N), [receiver, sender], are the median age, and the share lost between
+    the first and the last received message; NaN where none was received. `heard_at_s` and
+    `heard_age_s` (M,) are time and age of all received messages, s. `gaps` (G, 2) are times of
+    messages before which some were lost, and their number.
     """
 
     age_s: F64
@@ -178,7 +178,7 @@ class Messages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopLateness:
-    """A loop of one robot over the mission: (T,) time, s, and lateness in the minute before, ms."""
+    """Lateness of one robot's loop: (T,) time, s, and lateness in the minute before, ms."""
 
     time_s: F64
     p50_ms: F64
@@ -189,7 +189,7 @@ class LoopLateness:
 
 
 class ScriptCommand(NamedTuple):
-    """A command of the script, in words, with codes of its problem and of each robot's result."""
+    """A script's command as text, with codes of its problem and of each robot's result."""
 
     command: str
     done: bool
@@ -200,8 +200,8 @@ class ScriptCommand(NamedTuple):
 class ProgramRecord(NamedTuple):
     """One robot's program in a script's flight.
 
-    `changes` of its state as it said itself, s from the script's start; `last` is its last status
-    in the mission, or of all. `cpu_share` is of a core.
+    `changes` are its reported state changes, s from the script's start; `last` is its last status
+    in the mission, or of all. `cpu_share` is of one core.
     """
 
     changes: tuple[StateChange, ...]
@@ -212,18 +212,19 @@ class ProgramRecord(NamedTuple):
 
     @property
     def restarts(self) -> int:
-        """How often it came back into its mission."""
+        """Number of times the program returned into its mission."""
         return max(0, sum(c.state is FlightState.MISSION for c in self.changes) - 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ScriptRecord:
-    """How a fleet's flight by the script went; other flights have none of it.
+    """Course of a fleet's flight by a script; empty for other flights.
 
-    The script started at `start_s` of the record's times. `began_s` tells when each step began, s
-    from then; the last entry, `end`, when all was over. `problem` is what kept it from its end,
-    None if nothing did. `launcher` is what the processes of the ground and of the simulated
-    vehicles took: share of a core, and MB. Vehicles and robots were so far behind real time.
+    The script started at `start_s` of the record's times. `began_s` has the start of each step, s
+    from then; its last entry, `end`, is the end of the flight. `problem` is the reason of an early
+    end, or None. `launcher` is the CPU use (share of a core) and memory (MB) of the ground's and
+    the simulated vehicles' processes. `vehicles_behind_s` and `robots_behind_s` are lags behind
+    real time.
     """
 
     vehicle: str = ""
@@ -239,9 +240,9 @@ class ScriptRecord:
 
 
 class GivenOrder(NamedTuple):
-    """An order of the operator to robots, from its request until it was answered.
+    """An order of the operator to robots, from the request to the answer.
 
-    `ended_s` is inf while it is not.
+    `ended_s` is inf while it is pending.
     """
 
     kind: str
@@ -252,11 +253,11 @@ class GivenOrder(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FaultRecord:
-    """The fault of a drill's flight, and what its bounds need beside the true tracks.
+    """The fault in a drill's flight, and inputs of its bounds in addition to the true tracks.
 
-    `hit` are the vehicles that it was done to, `begin_s` when it began, `marks` further times by
-    their names. `pads_m` (N, 2) is where vehicles really stood at first, `drone_m` their size.
-    `late_s` is how far the machine that flew it was behind real time; 0 on a simulated clock.
+    `hit` are the affected vehicles, `begin_s` is the fault's begin, `marks` further times by name.
+    `pads_m` (N, 2) are the vehicles' true initial positions, `drone_m` their size. `late_s` is the
+    lag behind real time of the machine that flew it; 0 on a simulated clock.
     """
 
     hit: tuple[int, ...] = ()
@@ -268,22 +269,22 @@ class FaultRecord:
     late_s: float = 0.0
 
     def ordered(self, kind: str, robot: int) -> list[GivenOrder]:
-        """All orders of that kind to the robot."""
+        """All orders of a kind to the robot."""
         return [each for each in self.orders if each.kind == kind and robot in each.robots]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlightRecord:
-    """One mission and its robots, from takeoff to landing; see above for what its numbers mean.
+    """One mission and its robots, from takeoff to landing; the module defines its numbers.
 
-    Times count from the mission's begin, which was at Unix time `begin_s`, and lasted `duration_s`;
-    without a mission, from the flight's begin, and `duration_s` is 0. `from_s` and `to_s` are what
-    is shown. `robots` are the mission's. `truth` is where vehicles were, by name: also others than
-    the mission's, and beyond what is shown. Without a world `coverage` is None, and the costs are
-    empty. A robot's sensor sees `sensor_size` cells of the world. `clocks_known`: the robots'
-    clocks are corrected by what a ground heard. `rates` are None if logs do not tell, and of robots
-    that have not all the same. Simulators tell also the id of the bundle, the world's `features`,
-    and of points what became of messages, and the largest number in one, by its absolute value.
+    Times are from the mission's begin at Unix time `begin_s`; the mission lasts `duration_s`.
+    Without a mission they are from the flight's begin, and `duration_s` is 0. `from_s` and `to_s`
+    limit the figures. `robots` are the mission's. `truth` has the vehicles' true tracks by name,
+    also of other vehicles, and beyond the limits. Without a world `coverage` is None, and costs are
+    empty. A sensor sees `sensor_size` cells of the world. With `clocks_known` the robots' clocks
+    are corrected by the ground's log. `rates` are None if unknown, or if the robots' rates differ.
+    Simulators also give the bundle's id, the world's `features` and, for points, the counts of
+    messages by fate, and the largest absolute value in a payload.
     """
 
     name: str
@@ -312,25 +313,25 @@ class FlightRecord:
 
     @property
     def time_s(self) -> F64:
-        """(T,): when points were sampled. Raises ValueError for other robots."""
-        if not self.robots or any(robot.said for robot in self.robots):
+        """Sample times (T,) of points. Raises ValueError for other robots."""
+        if not self.robots or any(robot.statuses for robot in self.robots):
             raise ValueError(f"{self.name}: has no points")
         return self.robots[0].time_s
 
     @property
     def positions_m(self) -> F64:
-        """(T, N, 2): positions of points then, m. Raises ValueError for other robots."""
+        """Positions (T, N, 2) of points, m. Raises ValueError for other robots."""
         count = len(self.time_s)
         return np.stack([robot.position_m[:count, :2] for robot in self.robots], axis=1)
 
     @property
     def flew_mission(self) -> bool:
-        """Whether there was a mission, in which somebody flew."""
+        """Whether there was a mission with a robot in flight."""
         return self.duration_s > 0.0
 
     @property
     def took_off(self) -> bool:
-        """Whether a vehicle was in the air; without any track, whether a program says so."""
+        """Whether a vehicle was in the air; without tracks, whether a program reported it."""
         if any(len(track.time_s) for track in self.vehicles):
             return any(track.airborne.any() for track in self.vehicles)
         changes = (change for program in self.script.programs for change in program.changes)
@@ -338,7 +339,7 @@ class FlightRecord:
 
     @property
     def all_landed(self) -> bool:
-        """Whether they flew, and each says that it is down and disarmed, and is, where known."""
+        """Whether the fleet took off, and all robots are down and disarmed, also in truth."""
         return (
             self.took_off
             and not any(track.airborne[-1:].any() for track in self.vehicles)
@@ -350,12 +351,12 @@ class FlightRecord:
 
     @property
     def vehicles(self) -> tuple[TrueTrack, ...]:
-        """Where they were, in the order of `truth`."""
+        """True tracks in the order of `truth`."""
         return tuple(self.truth.values())
 
     @cached_property
     def _counted(self) -> tuple[F64, F64]:
-        """Times (C,) with robots that count for J; their positions (C, N, 2), m, others NaN."""
+        """Times (C,) with robots that count for J, and positions (C, N, 2), m, NaN for others."""
         if self.coverage is None or not len(self.cost_time_s):
             return np.zeros(0), np.zeros((0, len(self.robots), 2))
         places_m = np.stack(
@@ -366,17 +367,17 @@ class FlightRecord:
 
     @property
     def curve_time_s(self) -> F64:
-        """(C,): the times of `cost`, `true_cost` and what is normalised."""
+        """Times (C,) of `cost`, `true_cost` and their normalised curves."""
         return self._counted[0]
 
     @cached_property
     def cost(self) -> F64:
-        """(C,): J in model units, for where the robots took themselves to be."""
+        """J (C,) in model units, at the robots' estimated positions."""
         return self._costs(self._counted[1])
 
     @cached_property
     def true_cost(self) -> F64:
-        """(C,): J for where their vehicles were; NaN where that of one is not known."""
+        """J (C,) at the vehicles' true positions; NaN where one is unknown."""
         times_s, places_m = self._counted
         true_m = np.full_like(places_m, np.nan)
         for i, robot in enumerate(self.robots):
@@ -396,17 +397,17 @@ class FlightRecord:
 
     @property
     def normalized(self) -> F64:
-        """J over the first; empty without a world, and over a world without importance."""
+        """J over its first value; empty without a world, or if the world has no importance."""
         return _over_first(self.cost)
 
     @property
     def normalized_true(self) -> F64:
-        """True J over the first; NaN where it is not known."""
+        """True J over its first value; NaN where unknown."""
         return _over_first(self.true_cost)
 
     @cached_property
     def lloyd(self) -> float:
-        """J that Lloyd's algorithm comes to, which knows the world; NaN if it is not known."""
+        """J of Lloyd's algorithm, which knows the world; NaN if unknown."""
         _, places_m = self._counted
         if self.coverage is None or not len(places_m):
             return math.nan
@@ -414,28 +415,28 @@ class FlightRecord:
 
     @property
     def normalized_lloyd(self) -> float:
-        """Over the first J; NaN if it is not known."""
+        """J of Lloyd's algorithm over the first J; NaN if unknown."""
         return self.lloyd / self.cost[0] if len(self.cost) and self.cost[0] else math.nan
 
     @cached_property
     def separation(self) -> Separation | None:
-        """As the robots said; None if never two were in the air."""
+        """At estimated positions; None if two robots were never in the air together."""
         times_s = np.arange(self.from_s, self.to_s, _SEPARATION_PERIOD_S)
         return _least_distance(times_s, {r.name: r.places_at(times_s) for r in self.robots})
 
     @cached_property
     def true_separation(self) -> Separation | None:
-        """Of the vehicles; None also if that of one is not known."""
+        """At true positions; None also if a vehicle's track is unknown."""
         return least_separation(self.truth)
 
     @cached_property
     def fence_margin_m(self) -> float:
-        """How far inside the fence the robots said to be; NaN if there is no telling."""
+        """Margin at estimated positions; NaN if unknown."""
         return self._margin_m([robot.position_m[robot.flying] for robot in self.robots])
 
     @cached_property
     def true_fence_margin_m(self) -> float:
-        """How far inside the fence the vehicles were."""
+        """Margin at true positions; NaN if unknown."""
         return self._margin_m([track.position_m[track.airborne] for track in self.truth.values()])
 
     def _margin_m(self, places_m: list[F64]) -> float:
@@ -449,17 +450,17 @@ class FlightRecord:
 
     @cached_property
     def restarts(self) -> Mapping[str, int]:
-        """How often programs were started again, of those that were."""
-        starts = {r.name: len({said.boot_nonce for said in r.said}) for r in self.robots}
+        """Number of restarts of each program that restarted."""
+        starts = {r.name: len({status.boot_nonce for status in r.statuses}) for r in self.robots}
         return {name: count - 1 for name, count in starts.items() if count > 1}
 
     @cached_property
     def alarms(self) -> tuple[FirstAlarm, ...]:
-        """Each robot's, as they came."""
+        """First occurrences of all alarms, in order of time."""
         first_s: dict[tuple[str, Reason], float] = {}
         for robot in self.robots:
-            for said, time_s in zip(robot.said, robot.time_s.tolist(), strict=False):
-                for alarm in said.alarms:
+            for status, time_s in zip(robot.statuses, robot.time_s.tolist(), strict=False):
+                for alarm in status.alarms:
                     first_s.setdefault((robot.name, alarm), time_s)
         return tuple(
             sorted(
@@ -469,7 +470,7 @@ class FlightRecord:
         )
 
     def mission_share(self, robot: RobotRecord) -> float:
-        """Share of the mission's time in which it flew the mission."""
+        """Share of the mission's time in which the robot flew the mission."""
         flown_s = sum(
             max(0.0, min(end_s, self.duration_s) - max(begin_s, 0.0))
             for state, begin_s, end_s in robot.intervals(self.to_s)
@@ -487,7 +488,7 @@ class FlightRecord:
         return found
 
     def seen(self, time_s: float) -> npt.NDArray[np.bool_]:
-        """Cells of the world that lay in a robot's sensor view in the mission so far, [x, y]."""
+        """Cells of the world [x, y] seen by a sensor in the mission until `time_s`."""
         assert self.coverage is not None
         world_size = len(self.coverage.importance)
         seen = np.zeros((world_size, world_size), np.bool_)
@@ -501,19 +502,21 @@ class FlightRecord:
         return seen
 
 
-def changes_of(times_s: Sequence[float], said: Sequence[LoggedStatus]) -> tuple[StateChange, ...]:
-    """Each state that a robot entered by what it said at these times, with why."""
+def changes_of(
+    times_s: Sequence[float], statuses: Sequence[LoggedStatus]
+) -> tuple[StateChange, ...]:
+    """State changes in a robot's statuses, with reasons."""
     return tuple(
         StateChange(time_s, status.state, status.reason)
-        for k, (time_s, status) in enumerate(zip(times_s, said, strict=True))
-        if k == 0 or status.state is not said[k - 1].state
+        for k, (time_s, status) in enumerate(zip(times_s, statuses, strict=True))
+        if k == 0 or status.state is not statuses[k - 1].state
     )
 
 
 def least_separation(tracks: Mapping[str, TrueTrack]) -> Separation | None:
     """The least distance of two vehicles while both are in the air.
 
-    None if never two were, and if of one nothing is known.
+    None if two never were, or if a track is empty.
     """
     if not tracks or not all(len(track.time_s) for track in tracks.values()):
         return None
@@ -524,7 +527,7 @@ def least_separation(tracks: Mapping[str, TrueTrack]) -> Separation | None:
 
 
 def _least_distance(times_s: F64, places_m: Mapping[str, F64]) -> Separation | None:
-    """`places_m` (T, 3) by name; NaN where it does not count."""
+    """`places_m` (T, 3) by name; NaN where a place does not count."""
     least: Separation | None = None
     for (one, at_m), (other, other_m) in itertools.combinations(places_m.items(), 2):
         distances_m = np.linalg.norm(at_m - other_m, axis=1)
@@ -537,7 +540,7 @@ def _least_distance(times_s: F64, places_m: Mapping[str, F64]) -> Separation | N
 
 
 def quantile(values: F64, share: float) -> float:
-    """Of those that are known; NaN if none is."""
+    """Quantile of the finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if len(known) else math.nan
 

@@ -1,8 +1,8 @@
-"""Logs of robots and ground, brought together on one clock.
+"""Reads logs of robots and grounds onto one common clock.
 
-A robot says each status once; its own log has it, and the ground's too if it was heard. Times are
-made from the robot's uptime, which does not jump, and from when the ground heard it: so robots
-whose clocks were wrong line up. Without a ground's log their own clocks must do.
+A robot's status is in its own log, and in the ground's if it was received. Common times combine the
+robot's uptime, which never jumps, with the ground's reception times, so robots with wrong clocks
+line up. Without a ground's log, the robots' own clocks are used.
 """
 
 import bisect
@@ -21,6 +21,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.changes import plain
+from edge.core.counted import counted
 from edge.core.fence import Fence
 from edge.core.schema import explain
 from edge.drivers.flight_log import FlightLogError, FlightMetadata, Missing, read, read_metadata
@@ -37,7 +38,7 @@ from lpac.analysis.field_truth import (
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.truth import TRUTH, TrueTrack, load_truth
 
-# Of the times from saying to hearing, the share that may be shorter than the one that is believed.
+# Quantile of the transmission delays that is taken as the least one.
 _EARLY = 0.1
 _LATENESS = ("lateness_p50_ms", "lateness_p99_ms", "lateness_max_ms")
 
@@ -49,9 +50,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class LoggedStatus:
-    """The part of a status that reports need; `time_s` is Unix time of the common clock.
+    """Part of a status that reports need; `time_s` is Unix time of the common clock.
 
-    Loops whose lateness it did not know are left out; the landing point is NaN if it was.
+    Loops with unknown lateness are left out; an unknown landing point is NaN.
     """
 
     time_s: float
@@ -73,10 +74,10 @@ class LoggedStatus:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Received:
-    """The messages that one robot got, in order: (M,) each.
+    """Messages received by one robot, in order: (M,) each.
 
-    `time_s` is on the common clock, and `age_s` corrected by it. `sequence` is -1, and `age_s` NaN,
-    where the message could not be read; `accepted` where it was used.
+    `time_s` is on the common clock, and `age_s` corrected by it. If a message could not be decoded,
+    `sequence` is -1 and `age_s` NaN. `accepted` is 1 where the message was used.
     """
 
     time_s: F64
@@ -87,14 +88,14 @@ class Received:
 
 
 class LoopRates(NamedTuple):
-    """How often robots perceive; and decide, and speak."""
+    """Rates of perception, and of the policy and its messages."""
 
     perception_hz: float
     policy_hz: float
 
 
 class Ordered(NamedTuple):
-    """An order that a robot answered."""
+    """A robot's answer to an order."""
 
     time_s: float
     robot_id: int
@@ -106,12 +107,12 @@ class Ordered(NamedTuple):
 
 @dataclass(slots=True)
 class Logs:
-    """All that was found. `names` are the robots' by id, `statuses` and `received` by robot id.
+    """Contents of all logs. `names`, `statuses` and `received` are by robot id.
 
-    `clocks_known` are the programs that a ground heard; of the others' clocks nothing is known.
-    `programs_logged` are those whose own logs were found. `setups` are in the order of the times,
-    Unix s, at which they were told. `truths` are where vehicles were, by robot id, of one
-    simulation each. `notes` are for the reader.
+    `clocks_known` are the programs with a ground's log; the clocks of others are unknown.
+    `programs_logged` are those with a log of their own. `setups` are in the order of their Unix
+    times, s. `truths` are vehicles' true tracks by robot id, one mapping per simulation. `notes`
+    are for the reader.
     """
 
     names: dict[int, str] = field(default_factory=dict)
@@ -132,9 +133,9 @@ class Logs:
 
 
 def read_logs(folders: Sequence[Path], progress: Progress = lambda *_: None) -> Logs:
-    """Read all robots' and grounds' logs below `folders`, and what tells of the vehicles' truth.
+    """Read all logs of robots and grounds below `folders`, and the vehicles' true positions.
 
-    Raises ValueError if there are none, or a folder is not there.
+    Raises ValueError if there are no logs, or a folder does not exist.
     """
     paths: list[Path] = []
     for folder in folders:
@@ -148,7 +149,7 @@ def read_logs(folders: Sequence[Path], progress: Progress = lambda *_: None) -> 
             f"{where}: holds no logs (robot-*.mcap, ground-*.mcap): `lpac fleet pull` fetches them"
         )
     truths = [path for folder in folders for path in sorted(folder.rglob(TRUTH))]
-    if not truths:  # of a simulation, which knows better than any instrument
+    if not truths:  # a simulator's truth is better than any instrument
         for folder, name in itertools.product(folders, (TRUTH_TABLE, AUTOPILOT_LOGS)):
             truths += sorted(folder.rglob(name))
     return read_files([*paths, *truths], progress)
@@ -160,7 +161,7 @@ def simulated_name(robot_id: int) -> str:
 
 
 def read_files(paths: Sequence[Path], progress: Progress = lambda *_: None) -> Logs:
-    """Read these logs of robots and grounds, and files that tell where vehicles were."""
+    """Read these logs of robots and grounds, and files with true positions."""
     reader = _LogReader()
     paths = list(dict.fromkeys(path.resolve() for path in paths))
     for index, path in enumerate(paths):
@@ -170,7 +171,7 @@ def read_files(paths: Sequence[Path], progress: Progress = lambda *_: None) -> L
 
 
 def logs_of(statuses: Iterable[RobotStatus]) -> Logs:
-    """As if the robots' logs had been read, of which only what they said was kept."""
+    """Make logs from statuses alone."""
     reader = _LogReader()
     for status in statuses:
         reader.take_status(status)
@@ -178,33 +179,33 @@ def logs_of(statuses: Iterable[RobotStatus]) -> Logs:
 
 
 class _LogReader:
-    """Collects files, and then puts them on one clock."""
+    """Collects files, then puts them on one clock."""
 
     def __init__(self) -> None:
         self._logs = Logs()
-        # program -> sequence -> status, in uptime; the robots' own are the same.
+        # program -> sequence -> status, by uptime; the ground's copies are identical
         self._statuses: dict[Program, dict[int, LoggedStatus]] = defaultdict(dict)
-        # program -> what its clock said when it had begun, by each status
+        # program -> time of its start by its own clock, from each status
         self._own_starts_s: dict[Program, list[float]] = defaultdict(list)
-        # The last fence, as it was logged, and as it was understood.
+        # The last fence, as logged and as converted.
         self._fence: tuple[object, Fence | None] = None, None
-        # program -> when the ground heard it, less its uptime
-        self._heard: dict[Program, list[float]] = defaultdict(list)
-        # program -> as the columns of `Received`, in the robot's clock
+        # program -> reception time at the ground minus uptime
+        self._ground_starts_s: dict[Program, list[float]] = defaultdict(list)
+        # program -> rows of `Received`, by the robot's clock
         self._received: dict[Program, list[tuple[float, int, int, float, bool]]] = defaultdict(list)
-        self._orders: list[tuple[Program, Ordered]] = []  # in the robot's clock
+        self._orders: list[tuple[Program, Ordered]] = []  # by the robot's clock
         self._events: set[GroundEvent] = set()
-        # Unix time -> the origin that robots said to have from then on
+        # Unix time -> origin reported by robots from then on
         self._origins: dict[float, Origin] = {}
-        self._origin: Mapping[str, Any] | None = None  # the last of them, as it was logged
+        self._origin: Mapping[str, Any] | None = None  # the last one, as logged
         self._places: list[tuple[Path, Measured]] = []
 
     def take_status(self, status: RobotStatus) -> None:
-        """Take what a robot said, as its log would have it."""
+        """Add a robot's status, as if from its log."""
         self._take_status((status.robot_id, status.boot_nonce), plain(status))
 
     def read(self, path: Path) -> None:
-        """Take what is understood of a file; a note tells of the rest."""
+        """Add a file; notes describe the parts that are skipped."""
         notes = self._logs.notes
         if path.name == TRUTH or not path.match("*.mcap"):
             try:
@@ -213,9 +214,9 @@ class _LogReader:
                 else:
                     self._places.append((path, read_places(path)))
             except ValueError as error:
-                notes.append(f"{error}: left out")
+                notes.append(f"{error}: skipped")
             return
-        # topic -> why each message was not understood
+        # topic -> reason for each skipped message
         odd: dict[str, list[str]] = defaultdict(list)
         begun = False
         try:
@@ -237,11 +238,12 @@ class _LogReader:
             if not begun and not gaps:
                 notes.append(f"{path}: is empty")
         except FlightLogError as error:
-            notes.append(f"{error}: left out")
-        except ValueError as error:  # a message that is not even JSON
-            notes.append(f"{path}: {error}: left out from there")
+            notes.append(f"{error}: skipped")
+        except ValueError as error:  # a message that is not JSON
+            notes.append(f"{path}: {error}: the rest is skipped")
         notes += [
-            f"{path}: {why[0]}: left out: {len(why)} of topic {topic}" for topic, why in odd.items()
+            f"{path}: {why[0]}: {counted(len(why), 'message')} of topic {topic} skipped"
+            for topic, why in odd.items()
         ]
 
     def _begin_robot(self, path: Path) -> Program:
@@ -250,7 +252,7 @@ class _LogReader:
         self._logs.metadata.append(metadata)
         self._logs.programs_logged.add(program)
         if path.parent.name == "logs":
-            # `lpac fleet pull` calls the robots' folders by their names, a simulator by their ids.
+            # `lpac fleet pull` names folders by the robots' names, simulators by their ids.
             folder = path.parts[-3]
             name = simulated_name(int(folder)) if folder.isdecimal() else folder
             self._logs.names.setdefault(metadata.robot_id, name)
@@ -277,22 +279,22 @@ class _LogReader:
             kind, operator, trial = (str(message[key]) for key in ("kind", "operator", "trial"))
             order = Ordered(
                 time_s, program[0], kind, operator, trial,
-                refusal and _known(Refusal, refusal, "refusal"),
+                refusal and _convert(Refusal, refusal, "refusal"),
             )  # fmt: skip
             self._orders.append((program, order))
 
     def _take_from_ground(self, topic: str, time_s: float, message: Mapping[str, Any]) -> None:
         if topic == "setup":
-            self._logs.setups.append((time_s, _known(FleetSetup, message, "setup")))
+            self._logs.setups.append((time_s, _convert(FleetSetup, message, "setup")))
         elif topic == "event":
-            self._events.add(_known(GroundEvent, message, "event"))
+            self._events.add(_convert(GroundEvent, message, "event"))
         else:
             program = (int(message["robot_id"]), int(message["boot_nonce"]))
             name = str(message["name"])
             heard_s = _time_s(message, "heard_at_unix_s") - _time_s(message, "uptime_s")
             self._take_status(program, message)
             self._logs.names[program[0]] = name
-            self._heard[program].append(heard_s)
+            self._ground_starts_s[program].append(heard_s)
 
     def _take_status(self, program: Program, status: Mapping[str, Any]) -> None:
         sequence = int(status["sequence"])
@@ -300,15 +302,15 @@ class _LogReader:
             return
         unix_s = _time_s(status, "unix_time_s")
         own_start_s = unix_s - _time_s(status, "uptime_s")
-        self._statuses[program][sequence] = self._said(status)
+        self._statuses[program][sequence] = self._logged_status(status)
         self._own_starts_s[program].append(own_start_s)
         if status.get("origin") not in (None, self._origin):
             self._origin = status["origin"]
-            self._origins[unix_s] = _known(Origin, self._origin, "origin")
+            self._origins[unix_s] = _convert(Origin, self._origin, "origin")
 
-    def _said(self, status: Mapping[str, Any]) -> LoggedStatus:
+    def _logged_status(self, status: Mapping[str, Any]) -> LoggedStatus:
         position_m, fence = [*map(float, status["position_m"] or ())], status.get("fence")
-        said = _known(
+        logged = _convert(
             LoggedStatus,
             {
                 **status,
@@ -325,27 +327,28 @@ class _LogReader:
             },
             "status",
         )
-        # Nearly all have the same, and there are very many.
+        # Convert once: there are very many statuses, nearly all with the same fence.
         if fence != self._fence[0]:
-            self._fence = fence, None if fence is None else _known(Fence, fence, "fence")
-        return replace(said, fence=self._fence[1])
+            self._fence = fence, None if fence is None else _convert(Fence, fence, "fence")
+        return replace(logged, fence=self._fence[1])
 
     def logs(self) -> Logs:
         logs = self._logs
-        # By program: what turns its uptime into the common clock, and how far ahead its own is.
+        # By program: its start on the common clock, and how far its own clock is ahead.
         starts_s: dict[Program, float] = {}
         ahead_s: dict[Program, float] = {}
         for program, statuses in self._statuses.items():
             starts_s[program] = own_s = float(np.median(self._own_starts_s[program]))
-            if program in self._heard:
-                starts_s[program] = float(np.quantile(self._heard[program], _EARLY))
+            if program in self._ground_starts_s:
+                starts_s[program] = float(np.quantile(self._ground_starts_s[program], _EARLY))
                 logs.clocks_known.add(program)
             ahead_s[program] = own_s - starts_s[program]
             logs.statuses.setdefault(program[0], []).extend(
-                replace(said, time_s=starts_s[program] + said.time_s) for said in statuses.values()
+                replace(status, time_s=starts_s[program] + status.time_s)
+                for status in statuses.values()
             )
         for robot_statuses in logs.statuses.values():
-            robot_statuses.sort(key=lambda said: said.time_s)
+            robot_statuses.sort(key=lambda status: status.time_s)
         self._sort_received(starts_s, ahead_s)
         orders = (
             order._replace(time_s=order.time_s - ahead_s.get(program, 0.0))
@@ -353,7 +356,7 @@ class _LogReader:
         )
         logs.orders = sorted(orders, key=lambda order: order.time_s)
         logs.events = sorted(self._events, key=lambda event: event.unix_time_s)
-        logs.setups.sort(key=lambda told: told[0])
+        logs.setups.sort(key=lambda setup: setup[0])
         for _, setup in logs.setups:
             logs.names.update({robot_id: name for name, robot_id in setup.robots.items()})
         if self._places:
@@ -361,31 +364,31 @@ class _LogReader:
         return logs
 
     def _take_places(self) -> None:
-        """Of each robot whose folder holds what an instrument told; of the others nothing."""
+        """Add true tracks of robots whose folders contain measurements."""
         robots = {self._logs.name(robot_id): robot_id for robot_id in self._logs.statuses}
-        # A simulator's folders are called by the robots' ids.
+        # Simulators name folders by the robots' ids.
         folders = {str(robot_id): robot_id for robot_id in self._logs.statuses} | robots
-        told: dict[int, list[Measured]] = {robot_id: [] for robot_id in robots.values()}
+        measured: dict[int, list[Measured]] = {robot_id: [] for robot_id in robots.values()}
         unfixed: dict[str, None] = {}
         for path, places in self._places:
             of = next((folder.name for folder in path.parents if folder.name in folders), None)
             if of is None:
                 why = f"is not in the folder of a robot ({', '.join(robots)})"
-                self._logs.notes.append(f"{path}: {why}: left out")
+                self._logs.notes.append(f"{path}: {why}: skipped")
             elif not len(places.unix_s):
                 unfixed[of] = None
             elif places.is_global and not self._origins:
-                self._logs.notes.append(f"{path}: no robot told of the mission's origin: left out")
+                self._logs.notes.append(f"{path}: no robot's log has the mission's origin: skipped")
             else:
-                told[folders[of]].append(places)
-        if unfixed and any(told.values()):
+                measured[folders[of]].append(places)
+        if unfixed and any(measured.values()):
             self._logs.notes.append(
-                f"no RTK fix in the log of PX4: {', '.join(unfixed)}: less is known in truth"
+                f"no RTK fix in the PX4 log of {', '.join(unfixed)}: true positions are incomplete"
             )
-        if any(told.values()):
+        if any(measured.values()):
             to_mission = self._to_mission()
             self._logs.truths.append(
-                {robot_id: track_of(files, to_mission) for robot_id, files in told.items()}
+                {robot_id: track_of(files, to_mission) for robot_id, files in measured.items()}
             )
 
     def _to_mission(self) -> ToMission:
@@ -404,7 +407,7 @@ class _LogReader:
     def _sort_received(
         self, starts_s: Mapping[Program, float], ahead_s: Mapping[Program, float]
     ) -> None:
-        # A message names its sender, not the start of its program: the one that ran then sent it.
+        # A message names its sender, not the sender's program: take the one that ran at that time.
         began: dict[int, list[tuple[float, float]]] = defaultdict(list)
         for program, start_s in sorted(starts_s.items(), key=lambda item: item[1]):
             began[program[0]].append((start_s, ahead_s[program]))
@@ -422,7 +425,7 @@ class _LogReader:
 
 
 def configured(metadata: FlightMetadata, part: str) -> Mapping[str, Any]:
-    """A part of the robot's configuration; empty if that cannot be read."""
+    """A part of the robot's configuration; empty if it cannot be read."""
     try:
         found = json.loads(metadata.configuration)[part]
     except (ValueError, KeyError, TypeError):
@@ -430,8 +433,8 @@ def configured(metadata: FlightMetadata, part: str) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _known(cls: type[T], value: object, where: str) -> T:
-    """As `from_mapping`, but of another version's keys, which this one does not know, all go."""
+def _convert(cls: type[T], value: object, where: str) -> T:
+    """Like `from_mapping`, but ignores unknown keys, which other versions may write."""
     try:
         return msgspec.convert(value, cls)
     except msgspec.ValidationError as error:

@@ -1,4 +1,4 @@
-"""Which mission is under way: one of a name ends where the next begins."""
+"""Detects missions: where one ends, and the next of the same name begins."""
 
 from typing import NamedTuple, Protocol
 
@@ -21,7 +21,7 @@ class MissionStatus(Protocol):
 
 
 class _Flown(NamedTuple):
-    """A robot in a mission; `heard_s` is when it said so last."""
+    """A robot in a mission; `heard_s` is the time of its last status."""
 
     trial: str
     boot_nonce: int
@@ -29,11 +29,11 @@ class _Flown(NamedTuple):
 
 
 class MissionTracker:
-    """Follows what robots say, in the order of time.
+    """Tracks missions from statuses in order of time.
 
-    A robot has part in a mission from when it flies it until it is on the ground, disarmed, is
-    killed, begins another trial, or its trial is reset. The mission ends when nobody has part in
-    it. Who was heard no more for `silent_s` does not keep it going by itself.
+    A robot takes part in a mission from when it flies it until it is on the ground and disarmed, is
+    killed, begins another trial, or its trial is reset. The mission ends when no robot takes part.
+    A robot that has been silent for `silent_s` does not keep it alive.
     """
 
     def __init__(self, silent_s: float = _SILENT_S) -> None:
@@ -42,20 +42,20 @@ class MissionTracker:
 
     @property
     def robots(self) -> set[int]:
-        """The ids of those that have part in a mission."""
+        """Ids of the robots that take part in a mission."""
         return set(self._flown)
 
-    def begins(self, robot_id: int, said: MissionStatus, heard_s: float) -> bool:
-        """Take what a robot said; whether a mission begins with it."""
+    def begins(self, robot_id: int, status: MissionStatus, heard_s: float) -> bool:
+        """Add a robot's status; returns whether a mission begins with it."""
         before = self._flown.pop(robot_id, None)
-        goes_on = before is not None and before[:2] == (said.trial, said.boot_nonce)
-        now = _Flown(said.trial, said.boot_nonce, heard_s)
-        if said.state is FlightState.MISSION:
-            others = [flown for flown in self._flown.values() if flown.trial == said.trial]
+        goes_on = before is not None and before[:2] == (status.trial, status.boot_nonce)
+        now = _Flown(status.trial, status.boot_nonce, heard_s)
+        if status.state is FlightState.MISSION:
+            others = [flown for flown in self._flown.values() if flown.trial == status.trial]
             self._flown[robot_id] = now
             return not goes_on and all(heard_s - o.heard_s > self._silent_s for o in others)
-        # Who has lost its autopilot may get it back, and fly on.
-        killed = said.state is FlightState.FAULT and said.armed is False
-        if goes_on and not killed and (said.state not in ON_GROUND or said.armed):
+        # A robot that lost its autopilot may recover, and fly on.
+        killed = status.state is FlightState.FAULT and status.armed is False
+        if goes_on and not killed and (status.state not in ON_GROUND or status.armed):
             self._flown[robot_id] = now
         return False

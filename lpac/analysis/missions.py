@@ -1,6 +1,6 @@
-"""Missions in the logs, and the record of each.
+"""Finds missions in logs and makes their records.
 
-A mission of one name that is flown again after all were on the ground, or reset, is another.
+After all robots were on the ground, or a reset, a mission of the same name is a new one.
 """
 
 import contextlib
@@ -37,14 +37,14 @@ from lpac.analysis.logs import (
 from lpac.analysis.mission_tracker import MissionTracker
 from lpac.analysis.truth import TrueTrack
 
-# A mission of which there is one status lasted as long as one is valid for.
+# Least duration of a mission, the time for which one status is valid.
 _LEAST_S = 0.25
-# What is shown before takeoff and after landing.
+# Time shown before takeoff and after landing.
 _MARGIN_S = 3.0
 
 
 class Mission(NamedTuple):
-    """When a mission was flown, by whom; Unix time of the common clock."""
+    """Time and robots of a mission; Unix time of the common clock."""
 
     name: str
     begin_s: float
@@ -53,14 +53,14 @@ class Mission(NamedTuple):
 
 
 def find_missions(logs: Logs) -> list[Mission]:
-    """All missions, the first first."""
+    """All missions, in order of time."""
     mission_tracker = MissionTracker()
     parts: dict[str, list[dict[int, list[float]]]] = {}
-    for robot_id, said in _in_order(logs):
-        if mission_tracker.begins(robot_id, said, said.time_s):
-            parts.setdefault(said.trial, []).append({})
-        if said.state is FlightState.MISSION:
-            parts[said.trial][-1].setdefault(robot_id, []).append(said.time_s)
+    for robot_id, status in _in_order(logs):
+        if mission_tracker.begins(robot_id, status, status.time_s):
+            parts.setdefault(status.trial, []).append({})
+        if status.state is FlightState.MISSION:
+            parts[status.trial][-1].setdefault(robot_id, []).append(status.time_s)
     missions = [
         Mission(
             (name or "no name") + ("" if number == 1 else f" ({number})"),
@@ -75,16 +75,16 @@ def find_missions(logs: Logs) -> list[Mission]:
 
 
 def _in_order(logs: Logs) -> Iterator[tuple[int, LoggedStatus]]:
-    """All robots' statuses in order of time, with the robot's id."""
-    said = [zip(itertools.repeat(robot), statuses) for robot, statuses in logs.statuses.items()]
-    return heapq.merge(*said, key=lambda one: one[1].time_s)
+    """All robots' ids and statuses in order of time."""
+    streams = [zip(itertools.repeat(robot), statuses) for robot, statuses in logs.statuses.items()]
+    return heapq.merge(*streams, key=lambda one: one[1].time_s)
 
 
 def record_of(
     logs: Logs, mission: Mission, others: Sequence[Mission], coverage: Coverage | None,
     sensor_size: int, configured_fence: Fence | None,
 ) -> FlightRecord:  # fmt: skip
-    """The record of a mission; it ends where one of `others` begins, or had ended."""
+    """The record of a mission; `others` with the same robots limit its time."""
     begin_s, duration_s = mission.begin_s, max(mission.end_s - mission.begin_s, _LEAST_S)
     earliest_s = max(
         (o.end_s for o in others if o.end_s <= begin_s and set(o.robots) & set(mission.robots)),
@@ -110,8 +110,8 @@ def whole_record(
     logs: Logs, robots: Sequence[int], coverage: Coverage | None, sensor_size: int,
     configured_fence: Fence | None,
 ) -> FlightRecord:  # fmt: skip
-    """The record of all that robots did where there was no mission."""
-    times_s = [said.time_s for robot in robots for said in logs.statuses.get(robot, ())]
+    """The record of a flight without a mission."""
+    times_s = [status.time_s for robot in robots for status in logs.statuses.get(robot, ())]
     begin_s, end_s = min(times_s, default=0.0), max(times_s, default=0.0)
     return _record(
         logs, Mission("no mission", begin_s, begin_s, tuple(robots)), 0.0, (0.0, end_s - begin_s),
@@ -129,8 +129,12 @@ def _record(
         _robot(robot, logs.name(robot), logs.statuses.get(robot, []), begin_s, from_s, to_s)
         for robot in mission.robots
     )
-    fences = [said.fence for robot in robots for said in robot.said if said.fence is not None]
-    programs = {(robot.robot_id, said.boot_nonce) for robot in robots for said in robot.said}
+    fences = [
+        status.fence for robot in robots for status in robot.statuses if status.fence is not None
+    ]
+    programs = {
+        (robot.robot_id, status.boot_nonce) for robot in robots for status in robot.statuses
+    }
     clocks_known = programs <= logs.clocks_known
     return FlightRecord(
         name=mission.name,
@@ -147,14 +151,14 @@ def _record(
         commands=_commands(logs, mission, from_s, to_s),
         messages=_messages(logs, mission, clocks_known),
         lateness=_lateness(robots, duration_s),
-        world_ids=tuple(sorted({said.world_id for robot in robots for said in robot.said})),
+        world_ids=tuple(sorted({status.world_id for robot in robots for status in robot.statuses})),
         clocks_known=clocks_known,
         rates=_rates(logs, programs),
     )
 
 
 def _rates(logs: Logs, programs: set[Program]) -> LoopRates | None:
-    """Those of all of these programs; None if they differ, or one is not known."""
+    """Rates of these programs; None if they differ or one is unknown."""
     known: dict[Program, LoopRates] = {}
     for metadata in logs.metadata:
         rates = configured(metadata, "rates")
@@ -167,7 +171,7 @@ def _rates(logs: Logs, programs: set[Program]) -> LoopRates | None:
 
 
 def _truth(logs: Logs, mission: Mission, from_s: float, to_s: float) -> dict[str, TrueTrack]:
-    """Of the simulation in which the mission was flown; nothing if there was none."""
+    """True tracks of the simulation in which the mission was flown; empty if there is none."""
     for tracks in logs.truths:
         own = [tracks[robot] for robot in mission.robots if robot in tracks]
         if any(len(t.time_s) and t.time_s[0] <= mission.begin_s <= t.time_s[-1] for t in own):
@@ -179,8 +183,8 @@ def _truth(logs: Logs, mission: Mission, from_s: float, to_s: float) -> dict[str
 
 
 def _flight(statuses: list[LoggedStatus], mission: Mission) -> tuple[float, float]:
-    """When the robot left the ground for the mission, and was on it again."""
-    times_s = [said.time_s for said in statuses]
+    """Times of the robot's takeoff for the mission and its landing."""
+    times_s = [status.time_s for status in statuses]
     first, last = (int(np.searchsorted(times_s, at)) for at in (mission.begin_s, mission.end_s))
     first, last = min(first, len(times_s) - 1), min(last, len(times_s) - 1)
     while first > 0 and statuses[first].state not in ON_GROUND:
@@ -198,22 +202,22 @@ def _robot(
     from_s: float,
     to_s: float,
 ) -> RobotRecord:
-    said = tuple(s for s in statuses if from_s <= s.time_s - begin_s <= to_s)
+    shown = tuple(s for s in statuses if from_s <= s.time_s - begin_s <= to_s)
     nowhere = (math.nan, math.nan, math.nan)
     return RobotRecord(
         robot_id=robot_id,
         name=name,
-        said=said,
-        time_s=np.array([s.time_s - begin_s for s in said]),
-        position_m=np.array([s.position_m or nowhere for s in said]).reshape(-1, 3),
-        flying=np.array([in_air(s) for s in said], np.bool_),
+        statuses=shown,
+        time_s=np.array([s.time_s - begin_s for s in shown]),
+        position_m=np.array([s.position_m or nowhere for s in shown]).reshape(-1, 3),
+        flying=np.array([in_air(s) for s in shown], np.bool_),
     )
 
 
 def _commands(logs: Logs, mission: Mission, from_s: float, to_s: float) -> tuple[CommandEntry, ...]:
-    """From the ground's log; without one, the orders that robots answered."""
+    """Commands in the ground's log; without one, the orders that robots answered."""
     begin_s = mission.begin_s
-    told = [
+    commands = [
         CommandEntry(
             event.unix_time_s - begin_s, event.operator, event.robot, event.text,
             event.kind != "refusal",
@@ -221,9 +225,9 @@ def _commands(logs: Logs, mission: Mission, from_s: float, to_s: float) -> tuple
         for event in logs.events
         if event.kind in ("command", "result", "refusal", "commander")
     ]  # fmt: skip
-    told = [command for command in told if from_s <= command.time_s <= to_s]
-    if not told:
-        told = [
+    commands = [command for command in commands if from_s <= command.time_s <= to_s]
+    if not commands:
+        commands = [
             CommandEntry(
                 order.time_s - begin_s, order.operator, logs.name(order.robot_id),
                 order.kind if order.refusal is None else f"{order.kind}: {order.refusal.text}",
@@ -232,7 +236,7 @@ def _commands(logs: Logs, mission: Mission, from_s: float, to_s: float) -> tuple
             for order in logs.orders
             if order.robot_id in mission.robots
         ]  # fmt: skip
-    return tuple(command for command in told if from_s <= command.time_s <= to_s)
+    return tuple(command for command in commands if from_s <= command.time_s <= to_s)
 
 
 def _messages(logs: Logs, mission: Mission, clocks_known: bool) -> Messages | None:
@@ -240,7 +244,7 @@ def _messages(logs: Logs, mission: Mission, clocks_known: bool) -> Messages | No
     if not any(robot in logs.received for robot in robots):
         return None
     age_s, loss = np.full((2, len(robots), len(robots)), np.nan)
-    heard, gaps, rejected = [], [], 0
+    arrivals, gaps, rejected = [], [], 0
     for row, receiver in enumerate(robots):
         received = logs.received.get(receiver)
         if received is None:
@@ -252,24 +256,24 @@ def _messages(logs: Logs, mission: Mission, clocks_known: bool) -> Messages | No
             if not own.any():
                 continue
             times_s = received.time_s[own] - mission.begin_s
-            # Clocks are corrected to a few ms, and no message comes before it was sent.
+            # Clocks are corrected to a few ms only, but no age is negative.
             ages_s = received.age_s[own].clip(min=0.0 if clocks_known else -math.inf)
             missing = _missing(received, own)
-            heard.append(np.stack([times_s, ages_s], axis=1))
+            arrivals.append(np.stack([times_s, ages_s], axis=1))
             gaps.append(np.stack([times_s[1:], missing], axis=1)[missing > 0])
             age_s[row, column] = np.median(ages_s)
             loss[row, column] = missing.sum() / (missing.sum() + own.sum())
-    all_heard = np.concatenate([np.zeros((0, 2)), *heard])
+    all_received = np.concatenate([np.zeros((0, 2)), *arrivals])
     return Messages(
-        age_s, loss, all_heard[:, 0], all_heard[:, 1],
+        age_s, loss, all_received[:, 0], all_received[:, 1],
         np.concatenate([np.zeros((0, 2)), *gaps]), rejected,
     )  # fmt: skip
 
 
 def _missing(received: Received, own: npt.NDArray[np.bool_]) -> F64:
-    """(M - 1,): how many of a sender's messages are missing before each but the first.
+    """Number of messages lost before each of a sender's messages but the first: (M - 1,).
 
-    A sender that starts anew begins to count anew.
+    A restarted sender counts from 0 again.
     """
     steps = np.diff(received.sequence[own])
     return np.where(steps > 0.0, steps - 1.0, 0.0)
@@ -278,16 +282,18 @@ def _missing(received: Received, own: npt.NDArray[np.bool_]) -> F64:
 def _lateness(
     robots: tuple[RobotRecord, ...], duration_s: float
 ) -> dict[str, dict[str, LoopLateness]]:
-    """Loop -> robot's name -> lateness; robots that said nothing in the mission are left out."""
+    """Loop -> robot's name -> lateness; robots without a status in the mission are left out."""
     found: dict[str, dict[str, LoopLateness]] = {loop: {} for loop in LOOPS}
     for robot in robots:
         during = [
-            (time_s, said)
-            for time_s, said in zip(robot.time_s.tolist(), robot.said, strict=True)
+            (time_s, status)
+            for time_s, status in zip(robot.time_s.tolist(), robot.statuses, strict=True)
             if 0.0 <= time_s <= duration_s
         ]
         for loop in LOOPS:
-            known = [(time_s, said.loops[loop]) for time_s, said in during if loop in said.loops]
+            known = [
+                (time_s, status.loops[loop]) for time_s, status in during if loop in status.loops
+            ]
             if known:
                 found[loop][robot.name] = LoopLateness(
                     time_s=np.array([time_s for time_s, _ in known]),
@@ -301,5 +307,5 @@ def _lateness(
 
 
 def _counted_up(counts: list[int]) -> int:
-    """By how much a count grew; it begins anew with each start of the program."""
+    """Growth of a counter that restarts at 0 with the program."""
     return sum(max(after - before, 0) for before, after in itertools.pairwise(counts))

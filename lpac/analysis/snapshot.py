@@ -1,4 +1,4 @@
-"""A ground station's knowledge of its fleet, as its log holds it and its clients are told."""
+"""State of the fleet at a ground station, for its log and its clients."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -7,7 +7,7 @@ from edge.core.fence import Fence
 from edge.flight.margins import ErrorBudget
 from edge.messages.mission import FlightState, GroundState, Place, RobotStatus
 
-# A robot that said nothing for longer is not heard any more.
+# A robot without a status for longer is stale.
 FRESH_S = 2.0
 # A commander that was silent for longer is gone.
 COMMANDER_SILENT_S = 2.0
@@ -15,7 +15,7 @@ COMMANDER_SILENT_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class FleetSlot:
-    """One slot: its place (height and landing point), its pad (x, y), m, and who sits in it."""
+    """One slot: its place (height and landing point), its pad (x, y), m, and its robot."""
 
     place: Place
     pad_m: tuple[float, ...]
@@ -24,16 +24,16 @@ class FleetSlot:
 
 @dataclass(frozen=True, slots=True)
 class FleetSetup:
-    """The part that does not change, or seldom.
+    """Part of the state that changes rarely.
 
     `operator` is this station's. `robots` are the robots' ids by name, in the fleet's order. The
-    policy's world is `world_size` cells wide, `env_scale` of them per m, from the mission origin
-    on; its sensor sees `sensor_size` cells. `world` is the text of the robots' world file, called
-    `world_id`; "" if it is not known here. `truncation` and `norm` are what `rasterize` needs for
-    it. `fence` is the configured one. A slot's height is `base_height_m` + its number x
-    `slot_spacing_m`; how far places must be apart follows from `errors`. Robots land at once with a
-    battery of `battery_critical`, hold when they have heard no ground for `ground_timeout_s`, and
-    land `ground_lost_land_s` later. `insecure`: whoever is on the network can fly the fleet.
+    policy's world is `world_size` cells wide, with `env_scale` cells per m, and begins at the
+    mission origin; the sensor sees `sensor_size` cells. `world` is the text of the robots' world
+    file with the id `world_id`, "" if unknown. `truncation` and `norm` are arguments of
+    `rasterize`. `fence` is the configured one. A slot's height is `base_height_m` + its number x
+    `slot_spacing_m`; the distance of places follows from `errors`. Robots land at once at a battery
+    of `battery_critical`, hold when the ground has been silent for `ground_timeout_s`, and land
+    `ground_lost_land_s` later. `insecure`: anybody on the network can fly the fleet.
     """
 
     fleet: str
@@ -61,12 +61,12 @@ class FleetSetup:
 
 @dataclass(frozen=True, slots=True)
 class RobotSnapshot:
-    """A robot as the ground knows it; `status` is its newest, None if it was never heard.
+    """A robot as known to the ground; `status` is the newest one, None if there was none.
 
-    `age_s` is how long ago that came, `clock_offset_s` how far its clock is ahead of this one.
-    `rates_hz` are the rates at which it gets each neighbour's messages (robot id as text), over the
-    last few seconds, `arrivals` what came of each in the last ten (`Arrivals.counts`). `duplicate`:
-    two programs say that they are this robot.
+    `age_s` is the status's age, `clock_offset_s` how far the robot's clock is ahead of this one.
+    `rates_hz` are the rates of messages from each neighbour (robot id as text) over the last few
+    seconds, `arrivals` their counts by fate in the last ten (`Arrivals.counts`). `duplicate`: two
+    programs use this robot's id.
     """
 
     name: str
@@ -80,18 +80,18 @@ class RobotSnapshot:
 
     @property
     def fresh(self) -> bool:
-        """Whether it is heard."""
+        """Whether the newest status is fresh."""
         return self.age_s is not None and self.age_s <= FRESH_S
 
 
 @dataclass(frozen=True, slots=True)
 class FleetSnapshot:
-    """The fleet now. `unix_time_s` is the ground's clock.
+    """The fleet at one time. `unix_time_s` is the ground's clock.
 
-    `commander` is who commands, "" if nobody does yet; `ground` is the state that robots are told,
-    by whoever commands. `running` are the commands that run now, in words. `commander_age_s` is how
-    long ago the commander was heard, 0 if that is this station; `shares_name` whether another
-    station speaks in this one's name.
+    `commander` is the operator in command, "" if there is none yet; `ground` is the state that the
+    commander publishes. `running` are descriptions of the running commands. `commander_age_s` is
+    the time since the commander was heard, 0 if it is this station. `shares_name`: another station
+    uses this station's name.
     """
 
     unix_time_s: float
@@ -108,10 +108,10 @@ EventKind = Literal["command", "result", "refusal", "state", "commander", "prese
 
 @dataclass(frozen=True, slots=True)
 class GroundEvent:
-    """Something happened: a command and each of its results, a robot's new state, a new commander.
+    """An event: a command, one of its results, a robot's new state, or a new commander.
 
-    `robot` is a name, "" for the fleet; `operator` whose command it was, "" if nobody's. `trial` is
-    the mission's name then, and `state` a robot's new one.
+    `robot` is a name, "" for the fleet; `operator` gave the command, "" if there was none. `trial`
+    is the mission's name at the time, `state` a robot's new state.
     """
 
     unix_time_s: float

@@ -1,12 +1,12 @@
 """Statistics of results over worlds and trainings; less is better throughout.
 
-Values of a method are (S, K): of S trainings, which differ in their seed alone, over the same K
-worlds. A method of one training, such as a baseline, is (1, K). Worlds are drawn, and so are
-trainings: an interval is about the method only as far as it has several.
+A method's values are (S, K): S trainings that differ only in their seed, over the same K worlds. A
+method with one training, such as a baseline, is (1, K). Both worlds and trainings are resampled: an
+interval is about the method only if there are several trainings.
 
-Sources: interquartile mean, stratified bootstrap and performance profiles as Agarwal et al., "Deep
-Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264); the bound of a
-share: Clopper and Pearson, Biometrika 26 (1934).
+Sources: interquartile mean, stratified bootstrap and performance profiles as in Agarwal et al.,
+"Deep Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264); the bound
+of a share: Clopper and Pearson, Biometrika 26 (1934).
 """
 
 import math
@@ -20,11 +20,11 @@ import scipy  # its parts are loaded on first use: scipy.stats takes a second
 from edge.core import F64
 
 CONFIDENCE = 0.95
-# A claim about a method, and not about these of its trainings, needs so many.
+# Number of trainings needed for a claim about a method rather than these trainings.
 LEAST_TRAININGS = 3
-# Of fewer not even a difference of one sign in all of them would be telling: 2 * 0.5^5 > 0.05.
+# With fewer, even a difference of one sign in all worlds is not significant: 2 * 0.5^5 > 0.05.
 LEAST_WORLDS = 6
-# By what `compare` calls one better, for people.
+# Rule of `compare`, for people.
 VERDICT_RULE = (
     f"one is better if the 95 % interval of the difference of their mean costs, over the same "
     f"worlds, leaves 0 out, and there are {LEAST_WORLDS} worlds or more"
@@ -42,15 +42,15 @@ class Interval95(NamedTuple):
 
 
 def mean(values: F64) -> F64:
-    """(...,): of each (..., S, K)."""
+    """Mean (...,) of values (..., S, K)."""
     means: F64 = values.mean(axis=(-2, -1))
     return means
 
 
 def interquartile_mean(values: F64) -> F64:
-    """(...,): of each (..., S, K) the mean of the middle half of all its values.
+    """Mean (...,) of the middle half of values (..., S, K).
 
-    Where a quartile is inside a value's share, the value counts in part.
+    A value at the quartile counts in part.
     """
     ordered = np.sort(values.reshape(*values.shape[:-2], -1), axis=-1)
     edges = np.clip(np.linspace(0.0, 1.0, ordered.shape[-1] + 1), 0.25, 0.75)
@@ -59,12 +59,12 @@ def interquartile_mean(values: F64) -> F64:
 
 
 def difference_of_means(a: F64, b: F64) -> F64:
-    """(...,): of each (..., S, K) and (..., T, K); below 0 where `a` is better."""
+    """Difference (...,) of (..., S, K) and (..., T, K); below 0 where `a` is better."""
     return mean(a) - mean(b)
 
 
 def ratio_of_means(a: F64, b: F64) -> F64:
-    """(...,): of each (..., S, K) and (..., T, K); below 1 where `a` is better.
+    """Ratio (...,) of (..., S, K) and (..., T, K); below 1 where `a` is better.
 
     NaN where all of `b` is 0.
     """
@@ -73,9 +73,9 @@ def ratio_of_means(a: F64, b: F64) -> F64:
 
 
 def share_below(a: F64, b: F64) -> F64:
-    """(...,): in which share of the K worlds the mean of `a` over its trainings is below `b`'s.
+    """Share (...,) of the K worlds where the mean of `a` over its trainings is below that of `b`.
 
-    Of each (..., S, K) and (..., T, K); equal ones count half.
+    Arguments are (..., S, K) and (..., T, K); equal means count half.
     """
     offset = a.mean(axis=-2) - b.mean(axis=-2)
     shares: F64 = (offset < 0.0).mean(axis=-1) + 0.5 * (offset == 0.0).mean(axis=-1)
@@ -83,8 +83,8 @@ def share_below(a: F64, b: F64) -> F64:
 
 
 def bootstrap(values: F64, statistic: Callable[[F64], F64] = mean) -> Interval95:
-    """A statistic of (S, K), with the interval over other worlds and other trainings."""
-    return _interval(lambda *drawn: statistic(_taken(values, *drawn)), *values.shape)
+    """A statistic of (S, K), with its interval over worlds and trainings."""
+    return _interval(lambda *drawn: statistic(_select(values, *drawn)), *values.shape)
 
 
 def paired_bootstrap(
@@ -92,18 +92,18 @@ def paired_bootstrap(
 ) -> Interval95:
     """A statistic of two methods, (S, K) and (T, K), over the same worlds in the same order.
 
-    Worlds are drawn for both at once. Trainings are drawn for each by itself; or for both at once,
-    if they are the same, in the same order, and only fly otherwise. Raises ValueError if what is
-    drawn for both differs in number.
+    Worlds are resampled jointly. Trainings are resampled independently, or jointly with
+    `same_trainings`, where S = T are the same trainings in the same order. Raises ValueError if
+    numbers that must be equal differ.
     """
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"{a.shape[1]} worlds of one and {b.shape[1]} of the other: no pairs")
     if same_trainings and len(a) != len(b):
         raise ValueError(f"{len(a)} trainings of one and {len(b)} of the other: not the same")
     if same_trainings:
-        return _interval(lambda *drawn: statistic(_taken(a, *drawn), _taken(b, *drawn)), *a.shape)
+        return _interval(lambda *drawn: statistic(_select(a, *drawn), _select(b, *drawn)), *a.shape)
     return _interval(
-        lambda of_a, of_b, worlds: statistic(_taken(a, of_a, worlds), _taken(b, of_b, worlds)),
+        lambda of_a, of_b, worlds: statistic(_select(a, of_a, worlds), _select(b, of_b, worlds)),
         len(a), *b.shape,
     )  # fmt: skip
 
@@ -111,10 +111,10 @@ def paired_bootstrap(
 class Verdict(NamedTuple):
     """Whether method A is better than B over the same worlds.
 
-    `difference` and `ratio` are those of the means; `a_below_b` is the share of the worlds where
-    A's mean over its trainings is less, equal ones counting half. `better` is None if the data do
-    not tell: the difference's interval has 0 in it, or there are too few worlds. `of_methods` is
-    whether both have trainings enough for a claim about the methods; baselines need none.
+    `difference` and `ratio` are of the means; `a_below_b` is the share of worlds where A's mean
+    over its trainings is less, equal ones counting half. `better` is None if the interval of the
+    difference contains 0, or there are too few worlds. `of_methods` is whether both have enough
+    trainings for a claim about the methods; baselines need none.
     """
 
     better: Literal["a", "b"] | None
@@ -132,12 +132,12 @@ def compare(
     trained_b: bool = True,
     same_trainings: bool = False,
 ) -> Verdict:
-    """Compare (S, K) with (T, K) over the same worlds; see `paired_bootstrap`, also for errors."""
+    """Compare (S, K) with (T, K) over the same worlds; see `paired_bootstrap` for its errors."""
 
-    def told(statistic: Callable[[F64, F64], F64]) -> Interval95:
+    def interval(statistic: Callable[[F64, F64], F64]) -> Interval95:
         return paired_bootstrap(a, b, statistic, same_trainings=same_trainings)
 
-    difference = told(difference_of_means)
+    difference = interval(difference_of_means)
     better: Literal["a", "b"] | None = None
     if a.shape[1] >= LEAST_WORLDS and difference.high < 0.0:
         better = "a"
@@ -146,8 +146,8 @@ def compare(
     return Verdict(
         better,
         difference,
-        told(ratio_of_means),
-        told(share_below),
+        interval(ratio_of_means),
+        interval(share_below),
         all(
             not trained or len(values) >= LEAST_TRAININGS
             for values, trained in ((a, trained_a), (b, trained_b))
@@ -156,37 +156,39 @@ def compare(
 
 
 def what_would_tell(difference: Interval95, worlds: int) -> str:
-    """How many worlds would show which of two is better, where `worlds` do not; for people.
+    """Number of worlds that would show a difference where `worlds` do not, as text.
 
-    `difference` is the verdict's: intervals shrink with the root of the number of worlds.
+    `difference` is the verdict's; intervals shrink with the root of the number of worlds.
     """
     if worlds < LEAST_WORLDS:
         few = f"{worlds} worlds are" if worlds > 1 else "one world is"
-        return f"{few} too few to tell: at least {LEAST_WORLDS} are needed, and 50 often are"
+        return f"{few} too few: at least {LEAST_WORLDS} are needed, often 50"
     value, low, high = difference
     width = max(high - value, value - low)
     if not abs(value) > 0.001 * width:
-        return f"{worlds} worlds do not tell: no difference is seen in them"
+        return f"no difference is visible over {worlds} worlds"
     enough = max(worlds + 1, math.ceil(worlds * (width / abs(value)) ** 2))
-    return f"{worlds} worlds do not tell: if the difference is as it looks, about {enough} would"
+    return (
+        f"{worlds} worlds are too few to show this difference; about {enough} would, if it is real"
+    )
 
 
 def performance_profile(values: F64, thresholds: F64) -> F64:
-    """(len(thresholds),): the share of all values that are at most as much; it never falls."""
+    """Share of all values at or below each threshold (len(thresholds),); never falls."""
     ordered = np.sort(values, axis=None)
     return np.searchsorted(ordered, thresholds, side="right") / len(ordered)
 
 
 def mean_over_time(time_s: F64, curves: F64) -> F64:
-    """(...,): the area under curves (..., T) at times (T,), ascending, over their duration."""
+    """Time average (...,) of curves (..., T) at times (T,), ascending."""
     means: F64 = np.trapezoid(curves, time_s) / (time_s[-1] - time_s[0])
     return means
 
 
 def at_most_share(of: int, failed: int) -> float:
-    """The greatest share of failures that is still likely, at 95 % confidence, one-sided.
+    """Upper bound of the share of failures, at 95 % confidence, one-sided.
 
-    Clopper and Pearson's bound; of n without any it is 1 - 0.05^(1/n), about 3 / n.
+    Clopper and Pearson's bound; with no failures in n it is 1 - 0.05^(1/n), about 3 / n.
     """
     if of == 0:
         return 1.0
@@ -194,8 +196,8 @@ def at_most_share(of: int, failed: int) -> float:
     return float(test.proportion_ci(CONFIDENCE, method="exact").high)
 
 
-def _taken(values: F64, trainings: Any, worlds: Any) -> F64:
-    """(..., S, K): of (S', K') values those of trainings (..., S) and worlds (..., K)."""
+def _select(values: F64, trainings: Any, worlds: Any) -> F64:
+    """Select trainings (..., S) and worlds (..., K) of values (S', K'): (..., S, K)."""
     taken: F64 = values[trainings[..., :, None], worlds[..., None, :]]
     return taken
 
@@ -203,10 +205,10 @@ def _taken(values: F64, trainings: Any, worlds: Any) -> F64:
 def _interval(statistic: Callable[..., F64], *counts: int) -> Interval95:
     """Bootstrap a statistic of indices: (..., n) for each of the `counts`, drawn independently.
 
-    Draws whose statistic is NaN do not count; the interval is NaN if no other is left.
+    Draws with a NaN statistic are ignored; without other draws the interval is NaN.
     """
     whole = dict(enumerate(map(np.arange, counts)))
-    # scipy draws from no sample of one.
+    # scipy does not resample a sample of one.
     several = [place for place, count in enumerate(counts) if count > 1]
 
     def of_drawn(*drawn: Any, axis: int) -> F64:

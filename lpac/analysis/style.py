@@ -1,8 +1,8 @@
-"""How all figures look: for print, for the screen, and for the colour-blind.
+"""Common style of figures: for print, screen, and colour-blind readers.
 
-Colours are Okabe and Ito's. Density is grey, so that all of them stand out on it. In small maps the
-swarm has one colour, which no curve beside them has; where lines have to be followed each robot has
-its own. These repeat, so robots are labelled as well.
+Colours are by Okabe and Ito. Density is grey, so that all of them stand out on it. In small maps
+the swarm has one colour, used by no curve; where lines have to be followed, each robot has its own.
+These repeat, so robots are labelled as well.
 """
 
 import io
@@ -31,7 +31,7 @@ SCALE = LinearSegmentedColormap.from_list("scale", ["#fff7ec", "#fdbb84", "#d730
 UNSEEN_STRENGTH = 0.3
 DOTTED: Any = (0, (1, 1.5))
 DASHED: Any = (0, (3, 1.5))
-# By position, line colour and style; the swarm's colour is none of them.
+# Line colours and styles by index; without the swarm's colour.
 CURVES: tuple[tuple[str, Any], ...] = (
     (BLACK, "-"),
     (BLUE, "--"),
@@ -40,12 +40,12 @@ CURVES: tuple[tuple[str, Any], ...] = (
     (SKY, (0, (3, 1, 1, 1))),
     (VERMILLION, "-"),
 )
-# For more than that, where no map is beside: a policy and all baselines.
+# For more curves, in figures without a map: a policy and all baselines.
 MANY_CURVES: tuple[tuple[str, Any], ...] = (
     *CURVES, (ORANGE, "-"), (GREY, "--"), (YELLOW, "-."), (FAINT, "-"),
 )  # fmt: skip
 _ROBOTS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, YELLOW, BLACK)
-# What is written on these is white.
+# Text on these is white.
 DARK = (BLUE, GREEN, VERMILLION, BLACK)
 _S = FlightState
 STATE_COLOURS = {
@@ -82,23 +82,22 @@ _STYLE: dict[Any, Any] = {
 
 @contextmanager
 def figure(width_in: float, height_in: float) -> Iterator[Figure]:
-    """A figure that is drawn, within this context, in this style."""
+    """Make a figure; draw into it within this context, in the common style."""
     with mpl.rc_context(_STYLE):
         drawn = Figure(figsize=(width_in, height_in), layout="constrained")
         yield drawn
-        # Drawing lays out once more: only by then are axes of a fixed aspect, and what is beside
-        # them, in their places.
+        # Axes of fixed aspect, and their neighbours, reach their places only in a second layout.
         engine = drawn.get_layout_engine()
         assert engine is not None
         engine.execute(drawn)
 
 
 def save(drawn: Figure, path: Path) -> bytes:
-    """Write `path`.png and .pdf; gives the PNG. Raises OSError if it cannot be written."""
+    """Write `path`.png and .pdf; returns the PNG. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context(_STYLE):
         drawn.savefig(path.with_name(f"{path.name}.pdf"))
-        # It is laid out now: that takes as long again as drawing.
+        # The layout is final; another would take as long as drawing.
         drawn.set_layout_engine("none")
         png = io.BytesIO()
         drawn.savefig(png, format="png")
@@ -107,18 +106,18 @@ def save(drawn: Figure, path: Path) -> bytes:
 
 
 def robot_colour(index: int) -> str:
-    """Of the robot at this place in its record."""
+    """Colour of the robot at this index in its record."""
     return _ROBOTS[index % len(_ROBOTS)]
 
 
 def colours_of(count: int) -> list[str]:
-    """Of missions beside each other; black is their mean."""
+    """Colours of missions in one figure; black is reserved for their mean."""
     if count < len(CURVES):
         return [colour for colour, _ in CURVES[1 : count + 1]]
     return [to_hex(colour) for colour in mpl.colormaps["viridis"](np.linspace(0.0, 0.9, count))]
 
 
 def tidy(axes: Axes) -> None:
-    """As plots over time look."""
+    """Style axes of a plot over time."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", color="#d9d9d9", linewidth=0.4)

@@ -1,7 +1,7 @@
-"""Render templates of jinja2: HTML is escaped, other text is not.
+"""Renders templates of jinja2. HTML is escaped, other text is not.
 
-A package has its own in `templates`; all may extend and import this package's, such as the layout
-of a page that holds everything and opens without a network (`page.html`).
+A package's templates are in its folder `templates`. All may extend and import this package's, such
+as the layout of a self-contained page (`page.html`).
 """
 
 import base64
@@ -13,9 +13,9 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, se
 from markupsafe import Markup, escape
 
 
-def render(package: str, name: str, /, **told: Any) -> str:
+def render(package: str, name: str, /, **values: Any) -> str:
     """Render a package's template."""
-    return _environment(package).get_template(name).render(told)
+    return _environment(package).get_template(name).render(values)
 
 
 @cache
@@ -31,5 +31,5 @@ def _environment(package: str) -> Environment:
 
 
 def _code(text: str) -> Markup:
-    """As HTML; what is between backticks is code."""
+    """Convert to HTML; text between backticks becomes code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))

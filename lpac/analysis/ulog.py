@@ -1,4 +1,4 @@
-"""PX4's own log (ULog), topic by topic."""
+"""Reads PX4's log (ULog) by topic."""
 
 import struct
 from collections.abc import Sequence
@@ -9,20 +9,20 @@ import numpy.typing as npt
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-# By the name of a field: its values, in the order in which they were logged.
+# Values of each field by name, in the order of the log.
 Topic = dict[str, npt.NDArray[Any]]
 
 
 def read_topics(path: Path, names: Sequence[str]) -> dict[str, Topic]:
-    """Topics of these names, of their first instances.
+    """Read the first instances of these topics.
 
-    A log that ends in the middle, as of a PX4 that was killed, is read as far as it goes; one that
-    is not there, or is no log, holds nothing.
+    A truncated log, for example of a killed PX4, is read as far as possible; a missing or invalid
+    one gives nothing.
     """
     try:
         with path.open("rb") as file:
             log = ULog(file, [*names])
     except (OSError, ULogException, struct.error):
-        # Not even its beginning was written.
+        # Not even the header is complete.
         return {}
     return {data.name: data.data for data in log.data_list if data.multi_id == 0}

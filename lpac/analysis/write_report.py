@@ -1,6 +1,6 @@
-"""A report: the paper's figures, one HTML page, and numbers.
+"""Writes a report: figures, one HTML page, and numbers.
 
-Apart from what it is of, which draws nothing: what draws takes a second to load.
+Separate from `examination`, since importing matplotlib takes a second.
 """
 
 import json
@@ -23,14 +23,14 @@ SUMMARY = "report.json"
 
 
 class Drawn(NamedTuple):
-    """A flight's record, and its figures: PNG by name."""
+    """A flight's record and its figures, PNG by name."""
 
     record: FlightRecord
     figures: Mapping[str, bytes]
 
 
 def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Progress) -> Path:
-    """Write figures, page and summary to `out`; gives the page. Raises OSError."""
+    """Write figures, page and summary to `out`; returns the page's path. Raises OSError."""
     drawn = []
     slugs: set[str] = set()
     for index, record in enumerate(examined.records):
@@ -53,7 +53,7 @@ def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Pro
 def page(
     title: str, drawn: Sequence[Drawn], repeatability: bytes | None, notes: Iterable[str]
 ) -> str:
-    """The page's HTML, which holds everything."""
+    """HTML of the self-contained page."""
     return render(
         "lpac.analysis", "report.html", title=title, drawn=drawn, repeatability=repeatability,
         notes=notes, loops={loop: f"{loop} late, 99 % / max" for loop in LOOPS}, late=_late,
@@ -74,7 +74,7 @@ def _known(form: str, value: float) -> str:
 
 
 def _slug(name: str, taken: set[str]) -> str:
-    """A folder's name that no other mission has."""
+    """A unique folder name for a mission."""
     plain = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "mission"
     slug = next(
         slug
@@ -86,7 +86,7 @@ def _slug(name: str, taken: set[str]) -> str:
 
 
 def _draw(record: FlightRecord, folder: Path, times_s: Sequence[float]) -> dict[str, bytes]:
-    """PNG by figure."""
+    """Draw all figures of a record: PNG by name."""
     shown_s = [time_s for time_s in times_s if time_s <= record.duration_s]
     shown_s = shown_s or [share * record.duration_s for share in figures.SNAPSHOTS]
     drawn = {

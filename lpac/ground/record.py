@@ -32,7 +32,7 @@ from edge.core.counted import counted
 from edge.core.file_errors import in_words
 from edge.drivers.flight_log import FlightLog, topic
 from edge.messages.mission import FlightState, GroundState, RobotStatus
-from lpac.analysis.coverage import Coverage, Whereabouts, in_air
+from lpac.analysis.coverage import Coverage, LastPositions, in_air
 from lpac.analysis.mission_tracker import MissionTracker
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
 from lpac.ground.station.client import GroundError, listen
@@ -50,7 +50,7 @@ _MAX_TOTAL_BYTES = 2**34
 class Cost:
     """Cost of the robots' positions now: the paper's J, model units.
 
-    `robots` are those that count, by name (see `lpac.analysis.coverage.Whereabouts`);
+    `robots` are those that count, by name (see `lpac.analysis.coverage.LastPositions`);
     `flying_mission` whether one of them flies its mission, which begins anew as
     `lpac.analysis.mission_tracker` says. `initial` is J when the first of this trial did;
     `normalized` is J over that; `bound` is what Lloyd's algorithm comes to, which
@@ -109,7 +109,7 @@ class Recording:
         self._events: deque[GroundEvent] = deque(maxlen=400)
         self._explored: dict[str, str] = {}
         self._cost_at_s = 0.0
-        self._whereabouts = Whereabouts()
+        self._last_positions = LastPositions()
         self._mission_tracker = MissionTracker()
         # J at the start of each trial's last mission.
         self._initial: dict[str, float] = {}
@@ -169,7 +169,7 @@ class Recording:
                 "clock_offset_s": robot.clock_offset_s,
             }  # fmt: skip
             self._record("status", heard_at_s, heard)
-        places_m = self._whereabouts.counted(snapshot)
+        places_m = self._last_positions.counted(snapshot)
         if abs(now_s - self._cost_at_s) >= COST_PERIOD_S and self._coverage is not None:
             self._take_cost(snapshot, places_m, self._coverage)
 

@@ -81,7 +81,7 @@ class LoggedMissions:
 def ids_in(records: Mapping[str, FlightRecord]) -> list[str]:
     """The ids of the bundles that flew."""
     robots = [robot for record in records.values() for robot in record.robots]
-    return sorted({said.bundle_id for robot in robots for said in robot.said})
+    return sorted({status.bundle_id for robot in robots for status in robot.statuses})
 
 
 def _e1(of: LoggedMissions) -> Report:

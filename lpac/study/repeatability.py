@@ -28,8 +28,8 @@ def _takeoff_s(record: FlightRecord) -> float:
     armed_s = [
         time_s
         for robot in record.robots
-        for time_s, said in zip(robot.time_s.tolist(), robot.said, strict=False)
-        if said.state is FlightState.ARMING
+        for time_s, status in zip(robot.time_s.tolist(), robot.statuses, strict=False)
+        if status.state is FlightState.ARMING
     ]
     return min(armed_s, default=math.nan)
 

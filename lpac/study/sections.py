@@ -163,7 +163,7 @@ def _final(record: FlightRecord) -> str:
 
 def true_curve(record: FlightRecord) -> F64:
     """(C,): the cost for where the robots truly were, over the first; NaN where it is not known."""
-    points = not any(robot.said for robot in record.robots)
+    points = not any(robot.statuses for robot in record.robots)
     return record.normalized if points else record.normalized_true
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from edge.messages.mission import FlightState, GroundState, RobotStatus
-from lpac.analysis.coverage import Coverage, Whereabouts, in_air
+from lpac.analysis.coverage import Coverage, LastPositions, in_air
 from lpac.analysis.mission_tracker import MissionTracker
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.alarms import Alarm
@@ -190,7 +190,7 @@ class Missions:
         self._paths: dict[str, deque[tuple[float, float]]] = {}
         self._seen_before = False
         self._mission_tracker = MissionTracker()
-        self._whereabouts = Whereabouts()
+        self._last_positions = LastPositions()
 
     def begins(self, snapshot: FleetSnapshot) -> bool:
         """Whether this snapshot shows a mission that has no curve yet."""
@@ -236,7 +236,7 @@ class Missions:
             heard_s = snapshot.unix_time_s - robot.age_s
             if self._mission_tracker.begins(robot.robot_id, robot.status, heard_s):
                 self.curve = None
-        places_m = self._whereabouts.counted(snapshot)
+        places_m = self._last_positions.counted(snapshot)
         for name, (x_m, y_m) in places_m.items():
             if name not in flying:
                 continue

@@ -73,7 +73,7 @@ def test_it_says_what_its_columns_are_and_how_many_worlds_would_tell(
     policy, prior, _ = plain["conditions"][0]["results"]
     plain["conditions"] = [{**plain["conditions"][0], "compared": policy["against"][prior["name"]]}]
     [compared, _] = tables_of(plain)
-    assert "2 worlds are too few to tell: at least 6" in compared.note
+    assert "2 worlds are too few: at least 6" in compared.note
 
 
 def test_it_draws_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:

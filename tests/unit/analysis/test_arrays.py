@@ -22,14 +22,14 @@ class _Writer:
 
 @dataclass(frozen=True)
 class _Message:
-    """Any topic's; what is recorded need not have its fields."""
+    """Message of any topic; recorded messages need not have its fields."""
 
 
 TOPICS = {"state": topic("State", _Message), "other": topic("Other", _Message)}
 
 
 def write(folder: Path, name: str, *messages: dict[str, object]) -> None:
-    """A new file of that log, whose first message comes at 100 s."""
+    """Write a new file of that log, with the first message at 100 s."""
     log = FlightLog(folder, _Writer(name), TOPICS)
     for number, message in enumerate(messages):
         log.record("state", 100.0 + number, message)
@@ -115,7 +115,7 @@ def test_what_is_no_log_is_left_out_or_named(tmp_path: Path) -> None:
     write(tmp_path, "robot-3", {"count": 1})
     odd = tmp_path / "robot-4-0001.mcap"
     odd.write_text("this is no flight log")
-    with pytest.warns(UserWarning, match=r"robot-4-0001\.mcap.*: left out"):
+    with pytest.warns(UserWarning, match=r"robot-4-0001\.mcap.*: skipped"):
         assert log_arrays(tmp_path)["robot-3"]["state"]["count"].tolist() == [1]
     with pytest.raises(FlightLogError, match=r"robot-4-0001\.mcap"):
         log_arrays(odd)

@@ -1,4 +1,4 @@
-"""What the fleet's positions are worth, held against the core's own coverage."""
+"""Evaluation of the fleet's positions, compared with the core's coverage."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ from edge.core import F64
 from edge.core.coverage import coverage_cost, voronoi_cells
 from edge.core.world import format_world, parse_world, random_features, rasterize
 from edge.messages.mission import FlightState, RobotStatus
-from lpac.analysis.coverage import Coverage, Whereabouts
+from lpac.analysis.coverage import Coverage, LastPositions
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from tests.said import reason
 
@@ -46,7 +46,7 @@ def area(corners_m: list[tuple[float, float]]) -> float:
 
 
 def inside(corners_m: list[tuple[float, float]], points_m: F64) -> F64:
-    """How far inside a convex polygon points are, the least over its sides; m."""
+    """Distance of points inside a convex polygon, the least over its sides; m."""
     corners = np.array(corners_m)
     sides = np.roll(corners, -1, axis=0) - corners
     sides, corners = (part[np.linalg.norm(sides, axis=1) > 1e-6] for part in (sides, corners))
@@ -72,7 +72,7 @@ def test_cells_part_the_world_by_the_nearest_robot(positions_m: F64) -> None:
     assert len(cells_m) == len(positions_m)
     nearest = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
     np.fill_diagonal(nearest, np.inf)
-    if nearest.min() < 1e-3:  # whose the ground between them is, is then a matter of rounding
+    if nearest.min() < 1e-3:  # rounding decides between equally near robots
         return
     assert sum(map(area, cells_m)) == pytest.approx(32.0**2, rel=1e-6)
     points_m = np.random.default_rng(0).uniform(0.0, 32.0, (300, 2))
@@ -111,7 +111,7 @@ def test_the_bound_of_one_robot_is_the_centre_of_mass() -> None:
 def test_the_density_keeps_the_worlds_shape(size: int) -> None:
     image = COVERAGE.density(size)
     assert image.shape == (size, size) and image.dtype == np.uint8 and image.max() == 255
-    # Where the most is, in the world's own share: [x, y], not turned.
+    # The position of the maximum, relative to the world: [x, y], not transposed.
     highest = np.array(np.unravel_index(COVERAGE.importance.argmax(), (SIZE, SIZE))) / SIZE
     found = np.array(np.unravel_index(image.argmax(), image.shape)) / size
     assert np.abs(found - highest).max() < 2.0 / min(size, SIZE)
@@ -159,7 +159,7 @@ def snapshot(
 
 
 def counted(seen: FleetSnapshot) -> dict[str, tuple[float, float]]:
-    return Whereabouts().counted(seen)
+    return LastPositions().counted(seen)
 
 
 def test_who_counts() -> None:
@@ -177,12 +177,12 @@ def test_who_counts() -> None:
 
 
 def test_who_does_not_know_where_it_is_counts_in_the_air_where_it_was() -> None:
-    whereabouts = Whereabouts()
+    last_positions = LastPositions()
     here, nowhere = (S.HOLD, True, 0.1, 1.0), (S.HOLD, True, 0.1, None)
     other = (S.HOLD, True, 0.1, 5.0)
-    whereabouts.counted(snapshot(here, other))
-    assert whereabouts.counted(snapshot(nowhere, other, unix_time_s=1.9))["r0"] == (1.0, 2.0)
-    assert whereabouts.counted(snapshot(nowhere, other, unix_time_s=60.0))["r0"] == (1.0, 2.0)
-    whereabouts.counted(snapshot(here, other, unix_time_s=3.0))
+    last_positions.counted(snapshot(here, other))
+    assert last_positions.counted(snapshot(nowhere, other, unix_time_s=1.9))["r0"] == (1.0, 2.0)
+    assert last_positions.counted(snapshot(nowhere, other, unix_time_s=60.0))["r0"] == (1.0, 2.0)
+    last_positions.counted(snapshot(here, other, unix_time_s=3.0))
     on_ground = (S.LANDED, False, 0.1, None)
-    assert "r0" not in whereabouts.counted(snapshot(on_ground, other, unix_time_s=3.5))
+    assert "r0" not in last_positions.counted(snapshot(on_ground, other, unix_time_s=3.5))

@@ -1,4 +1,4 @@
-"""The report: from logs of flights that are known exactly, written by the real writers."""
+"""Reports from logs of exactly known flights, written by the real writers."""
 
 import contextlib
 import dataclasses
@@ -64,7 +64,7 @@ class Flown:
     step_m: tuple[tuple[float, float], ...]
 
     def place_m(self, robot: int, at_s: float) -> tuple[float, float]:
-        """Also before and after the mission, when it stands still."""
+        """Position at a time; constant before and after the mission."""
         flown_s = min(max(at_s - self.begin_s, 0.0), self.duration_s)
         (x, y), (dx, dy) = self.start_m[robot], self.step_m[robot]
         return x + dx * flown_s, y + dy * flown_s
@@ -91,7 +91,7 @@ SECOND = Flown("t2", 60.0, 12.0, ((4.0, 5.0), (8.0, 5.0), (4.0, 9.0)), ((1, 0.5)
 class Writer:
     """Writes the logs of `flights`, one after another, of robots whose clocks are `ahead_s`.
 
-    Every tenth message of robot 0 does not come to robot 1.
+    Every tenth message from robot 0 to robot 1 is lost.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Writer:
         self.world = WORLD
         self.bundle_id = BUNDLE.id
         self.age_s = AGE_S
-        # Other values of the ground's setup, and what becomes of each status in the files.
+        # Other values of the ground's setup, and changes of each status in the files.
         self.setup: dict[str, Any] = {}
         self.rates = [{"perception_hz": 5.0, "policy_hz": 2.5, "control_hz": 10.0}] * 3
         self.refused = {2: "not ready: battery"}
@@ -131,7 +131,7 @@ class Writer:
             yield at_s, self.change(status, at_s)
 
     def robots(self, folder: Path) -> None:
-        """As `lpac sim` leaves them: FOLDER/robots/<i>/logs."""
+        """Write to FOLDER/robots/<i>/logs, as `lpac sim` does."""
         for robot in range(3):
             configuration = json.dumps(
                 {
@@ -169,7 +169,7 @@ class Writer:
             )  # fmt: skip
 
     def ground(self, folder: Path) -> None:
-        """The ground's log, FOLDER/ground-0001.mcap."""
+        """Write the ground's log, FOLDER/ground-0001.mcap."""
         perception = BUNDLE.manifest.perception
         assert perception is not None
         setup = FleetSetup(
@@ -205,7 +205,7 @@ def examined(*folders: Path, **wanted: Any) -> Examined:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two missions, from robots whose clocks are wrong, and from the ground."""
+    """Two missions, in logs of the ground and of robots with wrong clocks."""
     folder = tmp_path_factory.mktemp("flown")
     writer = Writer((FIRST, SECOND), ahead_s=(0.0, 3.0, -5000.0))
     writer.robots(folder)
@@ -230,7 +230,7 @@ def test_a_mission_has_the_rates_that_all_of_its_robots_have(
 
 
 def test_two_answers_at_the_same_moment_are_in_any_order(flown: Path, tmp_path: Path) -> None:
-    """As of two simulated flights, whose clocks are the same."""
+    """As in two simulated flights with the same clocks."""
     other = Writer((FIRST,), ahead_s=(0.0, 3.0, -5000.0))
     other.refused = {}
     other.robots(tmp_path)
@@ -238,7 +238,7 @@ def test_two_answers_at_the_same_moment_are_in_any_order(flown: Path, tmp_path: 
 
 
 class Page(HTMLParser):
-    """What a page refers to, and shows."""
+    """References and images of a page."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -292,7 +292,7 @@ def test_the_numbers_are_those_of_the_flights(found: Examined) -> None:
 
 
 def test_message_ages_are_corrected_and_losses_counted(found: Examined) -> None:
-    """The clocks are off by seconds and by hours, and every tenth message of one pair is lost."""
+    """Clocks are off by seconds and by hours, and every tenth message of one pair is lost."""
     first, second = (values["messages"] for values in found.summary()["trials"])
     for told, flight in ((first, FIRST), (second, SECOND)):
         assert told["ages_corrected"] and told["rejected"] == 0
@@ -353,7 +353,7 @@ def test_from_the_grounds_log_alone(tmp_path: Path) -> None:
     assert values["cost"]["normalized"] == pytest.approx(FIRST.cost(30.0) / FIRST.cost(20.0))
     assert values["messages"] is None
     (note,) = found.notes
-    assert "no log of any robot is here" in note
+    assert "no log of any robot:" in note
 
 
 @pytest.mark.usefixtures("sketched")
@@ -362,7 +362,9 @@ def test_without_a_world_there_is_no_cost(tmp_path: Path) -> None:
     found = examined(tmp_path)
     (values,) = found.summary()["trials"]
     assert values["cost"]["initial"] is None and values["end_m"].keys() == {"r0", "r1", "r2"}
-    assert [f"world {id_of(WORLD)} is not here" in note for note in found.notes] == [True]
+    assert [f"the file of world {id_of(WORLD)} is missing" in note for note in found.notes] == [
+        True
+    ]
     assert found.without_cost == {"t1": found.notes[0]}
     write(found, tmp_path / "out", (0.0,), lambda *_: None)
     assert (tmp_path / "out/t1/snapshots.png").exists()
@@ -391,10 +393,10 @@ def test_each_mission_has_the_sizes_of_its_own_policy(tmp_path: Path, bundle_id:
 
 def test_robots_logs_alone_have_the_sizes_of_the_bundle_they_flew(tmp_path: Path) -> None:
     writer = Writer((FIRST,))
-    writer.bundle_id = "another"  # than the one that is at its place now
+    writer.bundle_id = "another"  # than the one at its path now
     writer.robots(tmp_path)
     (note,) = [note for note in examined(tmp_path).notes if "bundle" in note]
-    assert note.startswith("t1: the policy's bundle is not here (give it with --bundle)")
+    assert note.startswith("t1: the policy's bundle is missing: give it with --bundle")
     assert not [n for n in examined(tmp_path, bundle=SHIPPED).notes if "bundle" in n]
 
 
@@ -406,7 +408,7 @@ def test_a_world_without_importance_has_no_normalised_cost(tmp_path: Path) -> No
     arguments = ["report", str(tmp_path), "--out", str(tmp_path / "out"), "--times", "0"]
     result = CliRunner().invoke(app, arguments)
     assert "cost" not in result.stdout.splitlines()[0] and "nan" not in result.stdout
-    assert "note: t1: the world holds no importance: no normalised cost" in result.stdout
+    assert "note: t1: no normalised cost, because the world has no importance" in result.stdout
     cost = json.loads((tmp_path / "out/report.json").read_text())["trials"][0]["cost"]
     assert cost["initial"] == 0.0 and cost["normalized"] is cost["normalized_lloyd"] is None
     assert cost["curve"] == cost["time_s"] == []
@@ -428,11 +430,11 @@ def test_logs_that_break_off_and_robots_that_are_missing(tmp_path: Path, flown: 
     missions = [(mission.name, mission.robots) for mission in find_missions(logs)]
     assert missions == [("t1", (0, 1, 2)), ("t2", (0, 1, 2))]
     assert logs.programs_logged == {(1, 8), (2, 9)} and len(logs.received) == 2
-    assert len([note for note in logs.notes if note.endswith("left out")]) == 2
+    assert len([note for note in logs.notes if note.endswith("skipped")]) == 2
     found = examined(tmp_path, missions=("t1",))
     (values,) = found.summary()["trials"]
     assert values["robots"] == ["r0", "r1", "r2"]
-    assert any("no log of r0 is here" in note for note in found.notes)
+    assert any("no log of r0:" in note for note in found.notes)
     assert values["cost"]["normalized"] == pytest.approx(FIRST.cost(30.0) / FIRST.cost(20.0))
 
 
@@ -488,7 +490,7 @@ def test_one_name_flown_twice_is_two_missions(tmp_path: Path) -> None:
     again = dataclasses.replace(FIRST, begin_s=200.0)
     for folder, flight, nonce in (("a", FIRST, 10), ("b", again, 20)):
         Writer((flight,), nonce=nonce).robots(tmp_path / folder)
-    # As `lpac fleet pull` names its folders.
+    # Folder names of `lpac fleet pull`.
     (tmp_path / "a/robots/0").rename(tmp_path / "a/robots/alpha")
     logs = read_logs([tmp_path / name for name in "ab"], lambda *_: None)
     assert [mission.name for mission in find_missions(logs)] == ["t1", "t1 (2)"]
@@ -517,7 +519,7 @@ def one_landed(status: RobotStatus, at_s: float) -> RobotStatus:
 def test_a_mission_ends_when_all_have_landed_or_are_reset(
     tmp_path: Path, change: Callable[[RobotStatus, float], RobotStatus], flights: int
 ) -> None:
-    """As `lpac mission run` twice flies a script's trial: the robots' programs run on."""
+    """As when `lpac mission run` flies a script's trial twice without restarting the robots."""
     writer = Writer((FIRST, dataclasses.replace(FIRST, begin_s=50.0)))
     writer.change = change
     writer.ground(tmp_path)
@@ -541,7 +543,7 @@ def test_a_robot_that_does_not_know_where_it_is_counts_where_it_was(tmp_path: Pa
     after_s = cost.cost_time_s
     expected = np.array([FIRST.cost(20.0 + at_s) for at_s in after_s])
     assert cost.cost[after_s < 6.0] == pytest.approx(expected[after_s < 6.0], rel=1e-3)
-    # On the whole way it is where it was last, and the least distance is not told of that.
+    # It stays at its last position, which the least distance ignores.
     places_m = np.array([FIRST.place_m(robot, 30.0) for robot in range(3)])
     places_m[1] = FIRST.place_m(1, 26.0)
     assert cost.cost[-1] == pytest.approx(coverage_cost(IMPORTANCE, places_m * SCALE), rel=1e-3)
@@ -560,7 +562,7 @@ def test_without_any_position_for_seconds_the_cost_does_not_jump(tmp_path: Path)
     record = examined(tmp_path).records[0]
     assert len(record.curve_time_s) == len(record.cost_time_s)
     after_s = record.curve_time_s
-    # Robots 0 and 1 on their way, then where they were last.
+    # Robots 0 and 1 move, then stay at their last positions.
     in_between = (after_s > 2.0) & (after_s < 7.0)
     for at_s, cost in zip(after_s[in_between], record.cost[in_between], strict=True):
         places_m = [FIRST.place_m(robot, 22.0 if robot < 2 else 20.0 + at_s) for robot in range(3)]
@@ -571,7 +573,7 @@ def test_without_any_position_for_seconds_the_cost_does_not_jump(tmp_path: Path)
 
 @pytest.mark.slow
 def test_nothing_of_a_figure_is_cut(tmp_path: Path) -> None:
-    """Each state, an alarm and a restart: as many entries as a legend may have."""
+    """With each state, an alarm and a restart, legends have the most entries."""
     writer = Writer((FIRST,))
     flown = (S.ARMING, S.TAKEOFF, S.HOLD, S.RETURN, S.PILOT, S.FAULT, S.INIT)
     states = dict(enumerate(flown, 2))
@@ -662,7 +664,7 @@ def test_what_is_not_understood_is_left_out_and_told(
     found = examined(tmp_path)
     assert found.summary()["trials"][0]["robots"] == ["r0", "r2"]
     told = [re.sub("^.*/", "", note) for note in found.notes]
-    assert told[0].startswith(f"robot-1-0001.mcap: {why}") and "left out: 88 of topic" in told[0]
+    assert told[0].startswith(f"robot-1-0001.mcap: {why}") and "88 messages of topic" in told[0]
 
 
 @pytest.mark.usefixtures("sketched")
@@ -721,8 +723,8 @@ def test_mistakes_are_one_line(tmp_path: Path, flown: Path) -> None:
     for arguments, text in (
         ([empty], r"empty: holds no logs \(robot-\*\.mcap, ground-\*\.mcap\)"),
         ([tmp_path / "none"], r"none: is not a folder"),
-        ([grounded], r"no mission was flown in these logs, of 3 robots$"),
-        ([cut], r"of 0 robots; .*robot-1-0000\.mcap: .*: left out; .*; and 2 more such notes$"),
+        ([grounded], r"no mission in these logs, of 3 robots$"),
+        ([cut], r"of 0 robots; .*robot-1-0000\.mcap: .*: skipped; .*; and 2 more notes$"),
     ):
         with pytest.raises(ValueError, match=text):
             examined(*arguments)

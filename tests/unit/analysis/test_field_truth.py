@@ -1,4 +1,4 @@
-"""Where vehicles truly were, by what lies beside a field day's logs."""
+"""True positions from files beside a field day's logs."""
 
 import dataclasses
 import struct
@@ -15,7 +15,7 @@ from tests.ulog import HEADER, message
 from tests.unit.analysis.test_examination import BEGAN_S, FIRST, IMPORTANCE, SCALE, Writer, examined
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
-# How far the robots' positions are from the truth: x, y, m.
+# Error of the robots' positions: x, y, m.
 OFF_M = np.array([0.6, -0.4])
 TIMES_S = np.arange(FIRST.begin_s - 3.0, FIRST.begin_s + FIRST.duration_s + 3.0, 0.2)
 
@@ -46,7 +46,7 @@ def write_table(path: Path, robot: int, *, is_global: bool = False) -> None:
 
 
 def write_log(path: Path, robot: int, *, fix_type: int = 6, old: bool = False) -> None:
-    """As PX4 does, since v1.15 or before; it begins on the ground, and has no fix on the way up."""
+    """Write a log of PX4 v1.15 or older: it begins on the ground and lacks a fix while climbing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     place = "int32_t lat;int32_t lon;int32_t alt;"
     if not old:
@@ -96,8 +96,8 @@ def test_of_whom_nothing_is_known_leaves_the_true_figures_open(day: Path) -> Non
     found = examined(day)
     (values,) = found.summary()["trials"]
     elsewhere, unfixed = found.notes
-    assert "is not in the folder of a robot (r0, r1, r2): left out" in elsewhere
-    assert unfixed == "no RTK fix in the log of PX4: r2: less is known in truth"
+    assert "is not in the folder of a robot (r0, r1, r2): skipped" in elsewhere
+    assert unfixed == "no RTK fix in the PX4 log of r2: true positions are incomplete"
     assert values["truth"]["cost"]["final"] is None and values["truth"]["separation"] is None
 
 
@@ -108,7 +108,7 @@ def test_what_lies_between_two_places_is_not_made_up(day: Path) -> None:
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:20] + lines[30:]))
     (record,) = examined(day).records
-    # Between two places each; they are known until the first that is missing.
+    # NaN in the gap only.
     at_s = TIMES_S[18:31] - FIRST.begin_s - 0.1
     known = np.isfinite(record.truth["r0"].positions_at(at_s)[:, 0])
     assert known[0] and known[-1] and not known[1:-1].any()
@@ -142,11 +142,11 @@ def test_a_table_that_is_none_is_named(day: Path, text: str, why: str) -> None:
         read_places(path)
     assert why in str(error.value)
     (note,) = examined(day).notes
-    assert why in note and note.endswith("left out")
+    assert why in note and note.endswith("skipped")
 
 
 def write_simulated_log(folder: Path, robot: int, ahead_s: float) -> None:
-    """As a PX4 in software leaves it, whose clock is a tenth slow, and knows no time of day."""
+    """Write a log of a PX4 in software, with a clock 10 % slow and no time of day."""
     path = folder / "log" / "2026-11-29" / "19_50_11.ulg"
     path.parent.mkdir(parents=True)
     fields = (

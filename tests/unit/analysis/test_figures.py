@@ -1,4 +1,4 @@
-"""Text of figures beside their curves."""
+"""Text beside the curves of figures."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.said import reason
 
 
 def flight(*x_m: float) -> FlightRecord:
-    """A robot that goes along x, a second each; all importance is at 2 m."""
+    """A robot that moves along x in steps of a second; all importance is at 2 m."""
     importance = np.zeros((64, 64), np.float32)
     importance[30:34, 30:34] = 1.0
     time_s = np.arange(float(len(x_m)))
@@ -29,7 +29,7 @@ def flight(*x_m: float) -> FlightRecord:
         time_s=time_s,
         position_m=np.array([(x, 2.0, 5.0) for x in x_m]),
         flying=np.ones(len(x_m), np.bool_),
-        said=(said,) * len(x_m),
+        statuses=(said,) * len(x_m),
     )
     return FlightRecord(
         name="a flight",
@@ -48,7 +48,7 @@ def texts_of(figure: Figure) -> str:
     return " ".join(" ".join(texts).split())
 
 
-WHY = "may rise at first: robots leave what they cover, to see what nobody has seen"
+WHY = "may rise at first: robots leave covered areas to explore others"
 
 
 @pytest.mark.parametrize(

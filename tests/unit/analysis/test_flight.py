@@ -1,4 +1,4 @@
-"""The numbers of a flight's record, of flights that are known."""
+"""Numbers of the records of known flights."""
 
 import zipfile
 from pathlib import Path
@@ -12,13 +12,13 @@ from lpac.analysis.truth import TRUTH, TrueTrack, load_truth, write_truth
 
 
 def track(x_m: float, time_s: tuple[float, ...] = (405.29, 409.97)) -> TrueTrack:
-    """In the air, from one place on along y."""
+    """A track in the air, along y."""
     position_m = np.array([[x_m, float(k), 5.0] for k in range(len(time_s))])
     return TrueTrack(np.array(time_s), position_m, np.ones(len(time_s), np.bool_))
 
 
 def test_the_least_separation_is_told_of_tracks_of_any_times() -> None:
-    # The last of these times, by steps from the first, would be 2e-12 s behind it.
+    # The last of these times, in steps from the first, is 2e-12 s beyond it.
     separation = least_separation({"a": track(0.0), "b": track(3.0)})
     assert separation is not None
     assert abs(separation.distance_m - 3.0) < 1e-9 and separation.robots == ("a", "b")
@@ -56,10 +56,10 @@ def test_what_is_no_truth_is_left_out_and_told(tmp_path: Path) -> None:
     for arrays in (*written, {"x": np.zeros(2)}, {"0.time_s": np.zeros(2)}):
         np.savez(path, **arrays)  # type: ignore[arg-type]
         (note,) = read_files([path]).notes
-        assert note.endswith("left out") and "is no record of vehicles" in note
+        assert note.endswith("skipped") and "is not a file of true tracks" in note
     for data in (b"", b"PK nothing of the kind"):
         path.write_bytes(data)
-        with pytest.raises(ValueError, match="is no record of vehicles"):
+        with pytest.raises(ValueError, match="is not a file of true tracks"):
             load_truth(path)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("0.time_s.npy", bytes(2**20))

@@ -1,4 +1,4 @@
-"""Which mission is under way."""
+"""Detection of missions."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ class Said(NamedTuple):
         (Said(_S.HOLD), True),
         (Said(_S.LANDED, armed=True), True),
         (Said(_S.LANDED, armed=False), False),
-        # Its autopilot may answer again.
+        # Its autopilot may recover.
         (Said(_S.FAULT, armed=None), True),
         # Killed.
         (Said(_S.FAULT, armed=False), False),

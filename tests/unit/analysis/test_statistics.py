@@ -1,4 +1,4 @@
-"""What a set of results says, and how surely."""
+"""Statistics of results, and their uncertainty."""
 
 import math
 import re
@@ -28,7 +28,7 @@ COSTS = st.just(0.0) | st.floats(0.01, 10.0)
 
 @st.composite
 def methods(draw: st.DrawFn, count: int = 1) -> list[F64]:
-    """Of so many methods costs (S, K) over the same K worlds."""
+    """Costs (S, K) of `count` methods over the same K worlds."""
     worlds = draw(st.integers(1, 12))
     shapes = [(draw(st.integers(1, 4)), worlds) for _ in range(count)]
     return [
@@ -42,11 +42,11 @@ def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side(values, random
     middle = interquartile_mean(np.array([values]))
     low, high = np.quantile(values, (0.25, 0.75), method="inverted_cdf").tolist()
     assert low - 1e-9 <= middle <= high + 1e-9
-    # Four times the same values have no value that counts in part.
+    # Four copies of each value, so that no value counts in part.
     ordered = sorted(values * 4)
     kept = ordered[len(values) : 3 * len(values)]
     assert middle == pytest.approx(np.mean(kept))
-    # Neither order nor what is far out says anything.
+    # Order and outliers have no effect.
     shuffled = random.sample(values, len(values))
     shuffled[shuffled.index(max(values))] = max(values) + (1e6 if len(values) > 3 else 0.0)
     assert interquartile_mean(np.array([shuffled])) == pytest.approx(middle)
@@ -64,7 +64,7 @@ def test_an_interval_lies_within_the_values(drawn: list[F64]) -> None:
 
 @pytest.mark.parametrize("trainings", [1, 4])
 def test_an_interval_holds_the_truth_about_as_often_as_it_says(trainings: int) -> None:
-    """Of normal values, whose trainings differ: about 95 %; of few trainings less."""
+    """About 95 % for normal values with different trainings; less with few trainings."""
     rng = np.random.default_rng(0)
     held = 0
     for _ in range(60):
@@ -96,7 +96,7 @@ def test_no_method_is_better_than_itself(drawn: list[F64]) -> None:
 
 
 def test_pairs_tell_what_means_do_not() -> None:
-    """Worlds differ far more than the methods: only world by world it shows."""
+    """Worlds differ far more than the methods: only pairs show the difference."""
     rng = np.random.default_rng(0)
     worlds = rng.uniform(0.1, 0.9, (1, 30))
     a, b = worlds - 0.01, worlds + rng.normal(0.0, 0.005, (1, 30))
@@ -108,7 +108,7 @@ def test_pairs_tell_what_means_do_not() -> None:
 
 
 def test_one_good_training_of_several_proves_nothing() -> None:
-    """Worlds alone would say that A is better: its trainings differ by more than the methods."""
+    """Resampling worlds alone would favour A, whose trainings differ more than the methods."""
     worlds = np.random.default_rng(0).uniform(0.1, 0.9, (1, 30))
     b = np.repeat(worlds, 3, axis=0)
     a = b + np.array([[-0.1], [0.02], [0.05]])
@@ -118,7 +118,7 @@ def test_one_good_training_of_several_proves_nothing() -> None:
 
 
 def test_the_same_trainings_are_pairs_too() -> None:
-    """They differ by more than what each comes to if it flies otherwise."""
+    """Trainings differ more than the two ways of flying them."""
     worlds = np.random.default_rng(0).uniform(0.1, 0.9, (1, 30))
     b = worlds + np.array([[-0.1], [0.02], [0.05]])
     a = b - 0.01
@@ -126,7 +126,7 @@ def test_the_same_trainings_are_pairs_too() -> None:
     told = compare(a, b, same_trainings=True)
     assert told.better == "a" and told.of_methods
     assert told.difference.low == pytest.approx(told.difference.high)
-    # All trainings but one are worse for it.
+    # Worse with all trainings but one.
     a = b + np.array([[-0.1], [0.02], [0.05]])
     assert compare(a, b, same_trainings=True).better is None
     with pytest.raises(ValueError, match="3 trainings of one and 1 of the other: not the same"):
@@ -141,11 +141,11 @@ def test_few_worlds_prove_nothing() -> None:
 
 def test_how_many_worlds_would_tell() -> None:
     few = what_would_tell(Interval95(0.1, -0.5, 0.7), 2)
-    assert few == "2 worlds are too few to tell: at least 6 are needed, and 50 often are"
-    # Four times as many halve the interval, which then ends at 0.
+    assert few == "2 worlds are too few: at least 6 are needed, often 50"
+    # Four times the number halves the interval, which then ends at 0.
     some = what_would_tell(Interval95(0.1, -0.1, 0.3), 20)
-    assert some.endswith("if the difference is as it looks, about 80 would")
-    assert "no difference is seen" in what_would_tell(Interval95(0.0, -0.1, 0.1), 20)
+    assert some.endswith("about 80 would, if it is real")
+    assert "no difference is visible" in what_would_tell(Interval95(0.0, -0.1, 0.1), 20)
     rng = np.random.default_rng(1)
     a, b = rng.normal(0.0, 1.0, (1, 20)), rng.normal(0.2, 1.0, (1, 20))
     undecided = compare(a, b)
@@ -165,7 +165,7 @@ def test_ratio_and_share() -> None:
     assert ratio_of_means(a, b) == 1.0 and share_below(a, b) == 0.5
     assert math.isnan(ratio_of_means(a, 0.0 * b))
     assert all(map(math.isnan, compare(a, 0.0 * b).ratio))
-    # In some draws all of the other is 0: they tell nothing of the ratio.
+    # Draws in which all of the other is 0 do not count.
     seldom = compare(a, np.array([[0.0, 0.0, 2.0]])).ratio
     assert 0.0 < seldom.low < seldom.value < seldom.high < math.inf
 
@@ -194,10 +194,10 @@ def test_the_area_is_that_of_the_trapezia(steps: list[tuple[float, float, float]
 
 
 def test_how_seldom_it_is_at_least() -> None:
-    # None of 1,000 is "below 0.3 % at 95 % confidence".
+    # None of 1,000: "below 0.3 % at 95 % confidence".
     assert at_most_share(1000, 0) == pytest.approx(1.0 - 0.05 ** (1.0 / 1000), abs=1e-5)
     assert 0.0029 < at_most_share(1000, 0) < 0.003
-    # As R's binom.test(3, 100, alternative = "less").
+    # Like R's binom.test(3, 100, alternative = "less").
     assert at_most_share(100, 3) == pytest.approx(0.0757, abs=1e-3)
     assert at_most_share(5, 5) == at_most_share(0, 0) == 1.0
 

@@ -44,7 +44,8 @@ def mission() -> FlightRecord:
     coverage = record.coverage
     assert coverage is not None
     robots = tuple(
-        replace(r, said=tuple(said(t, bundle.id) for t in r.time_s.tolist())) for r in record.robots
+        replace(r, statuses=tuple(said(t, bundle.id) for t in r.time_s.tolist()))
+        for r in record.robots
     )
     read = Coverage(coverage.importance, coverage.cells_per_m, record.features)
     return replace(record, name="paper-1", robots=robots, coverage=read)
@@ -105,7 +106,7 @@ def test_a_logged_flight_is_held_against_baselines_from_where_it_began(
 
 def of_another_policy(mission: FlightRecord) -> FlightRecord:
     robots = tuple(
-        replace(r, said=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
+        replace(r, statuses=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
         for r in mission.robots
     )
     return replace(mission, name="paper-0", robots=robots)

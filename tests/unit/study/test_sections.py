@@ -84,7 +84,7 @@ def test_in_a_log_robots_are_taken_while_a_pilot_has_them() -> None:
 
     def logged(from_s: float) -> FlightRecord:
         robots = (
-            replace(robot, said=tuple(said(robot, t, from_s) for t in robot.time_s.tolist()))
+            replace(robot, statuses=tuple(said(robot, t, from_s) for t in robot.time_s.tolist()))
             for robot in record.robots
         )
         return replace(record, robots=tuple(robots))
