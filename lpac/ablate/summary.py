@@ -29,7 +29,7 @@ def write_report(
         name="ablation",
         title="What each part is worth",
         text=_text(ablation, results[0].variant.condition),
-        told=as_json(ablation, results),
+        data=as_json(ablation, results),
         rows=[["variant", "training", "world", "cost_over_first"], *_rows(ablation, results)],
         tables=[Table(_COLUMNS, [_row(result) for result in results], note=_NOTE)],
         figures=[Picture("differences.png", "differences to the base")],

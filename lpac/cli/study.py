@@ -85,7 +85,7 @@ def fly_study(task: StudyTask, ray: str | None, *, as_json: bool) -> None:
         typer.echo(json.dumps(report.document, indent=2))
         return
     show_report(report, task.folder)
-    if (opened := report.told["test_set_opened"]) is not None:
+    if (opened := report.data["test_set_opened"]) is not None:
         beside = "if you choose by this, it is no test set any more"
         typer.echo(f"the test set was opened, {opened['worlds']} worlds of it: {beside}")
 

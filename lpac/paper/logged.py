@@ -17,9 +17,9 @@ from lpac.sim.description import FIELD_SCALE
 from lpac.sim.points import cost_times_s
 from lpac.sim.scenario import Scenario
 from lpac.study.flights import CLAIRVOYANT, PlannedFlight, fly_all, records_of, sizes_of
-from lpac.study.hearing_robot import message_bytes
 from lpac.study.perturbation import absences_of, perturbed_by
 from lpac.study.rates import LOGGED_S, is_comparable, rates, results_of_logs
+from lpac.study.receiving_robot import message_bytes
 from lpac.study.report import Report
 from lpac.study.results import FAILS_ABOVE, MethodResult, conditions_json
 from lpac.study.sections import Section, perturbation, repeatability, snapshots

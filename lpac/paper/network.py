@@ -33,7 +33,7 @@ def network_report(told: Mapping[str, Any], made_by: Mapping[str, str]) -> Repor
         title="Network",
         text="The paper measures what a stream gets while the programs of three robots restart "
         "(Table I), and how that falls as robots are switched on one after another. " + flown,
-        told=told,
+        data=told,
         rows=[list(runs[0]), *(list(run.values()) for run in runs)],
         tables=[Table(headings, rows, note=note)],
         figures=[

@@ -12,7 +12,7 @@ import numpy as np
 from edge.policy.bundle import Bundle
 from lpac.analysis.template import render
 from lpac.paper.claims import Effort, Sizes, claims_of
-from lpac.study.hearing_robot import HearingRobot, message_bytes
+from lpac.study.receiving_robot import ReceivingRobot, message_bytes
 
 # Of which the median is how long one takes.
 _STEPS = 100
@@ -108,7 +108,7 @@ def sizes_of(bundle: Bundle) -> Sizes:
 
 def effort_of(bundle: Bundle) -> Effort:
     """Of a bundle's policy, medians, on this machine. Raises BundleError if no robot can fly it."""
-    robots = [HearingRobot(others, bundle) for others in (2, 100)]
+    robots = [ReceivingRobot(others, bundle) for others in (2, 100)]
     took_s = np.zeros((_STEPS, len(robots)))
     # In turns, so that what else the machine does meanwhile hits both.
     for step, number in itertools.product(range(_STEPS), range(len(robots))):

@@ -1,1 +1,1 @@
-"""How well policies cover, over many worlds, and how surely one is better than another."""
+"""Studies: policies and baselines flown over many worlds and compared."""

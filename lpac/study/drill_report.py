@@ -1,4 +1,4 @@
-"""What a drill comes to: a report, and JUnit's XML for whoever runs it among tests."""
+"""Reports of drills: README.md, CSV and JSON, and JUnit's XML for CI."""
 
 import math
 import shlex
@@ -20,7 +20,7 @@ Outcomes = Mapping[PlannedFlight, FlightOutcome]
 
 
 class FaultSummary(NamedTuple):
-    """All flights of one fault; `worst` has each figure where it came nearest its limit."""
+    """All flights of one fault; `worst` has the worst value of each figure."""
 
     fault: str
     flights: int
@@ -29,12 +29,12 @@ class FaultSummary(NamedTuple):
 
     @property
     def tightest(self) -> Figure | None:
-        """The figure with the least room."""
+        """The figure with the least margin."""
         return min(self.worst, key=lambda figure: figure.room, default=None)
 
 
 def summaries(outcomes: Outcomes) -> list[FaultSummary]:
-    """By fault, in the catalogue's order."""
+    """One summary per fault, in the catalogue's order."""
     by_fault: dict[str, list[FlightOutcome]] = {}
     for flight, outcome in outcomes.items():
         by_fault.setdefault(flight.scenario.fault, []).append(outcome)
@@ -51,7 +51,7 @@ def _worst(outcomes: Iterable[FlightOutcome]) -> tuple[Figure, ...]:
 
 
 def flown_again_by(flight: PlannedFlight) -> str:
-    """The command that flies exactly that flight again."""
+    """Command line that repeats a flight."""
     scenario = flight.scenario
     words = ["lpac", "drill", "--fault", flight.scenario.fault, "--seed", str(scenario.seed)]
     words += ["-n", str(scenario.robots)]
@@ -67,7 +67,7 @@ def flown_again_by(flight: PlannedFlight) -> str:
 
 
 def report_of(outcomes: Outcomes, made_by: Mapping[str, str]) -> Report:
-    """Each fault with the figure nearest its limit, and each flight that broke a promise."""
+    """Report with the least margin of each fault, and all flights that broke a promise."""
     rows = [
         (
             summary.fault,
@@ -80,8 +80,8 @@ def report_of(outcomes: Outcomes, made_by: Mapping[str, str]) -> Report:
     broken = {flight: outcome for flight, outcome in outcomes.items() if not outcome.held}
     share = 100.0 * at_most_share(len(outcomes), len(broken))
     note = [
-        f"{len(broken)} of {counted(len(outcomes), 'flight')} broke a promise: at 95 % confidence "
-        f"at most {share:.3g} % do, in this model"
+        f"{len(broken)} of {counted(len(outcomes), 'flight')} broke a promise: at most "
+        f"{share:.3g} % in this model, at 95 % confidence"
     ]
     for flight, outcome in broken.items():
         note += [f"{flight.scenario.fault}, seed {flight.scenario.seed}: {_why(outcome)}"]
@@ -93,9 +93,9 @@ def report_of(outcomes: Outcomes, made_by: Mapping[str, str]) -> Report:
     return Report(
         name="drill",
         title="Faults in flight",
-        text="Faults were done to a fleet in flight. Each promise is judged by where the vehicles "
-        "really were.",
-        told=_told(outcomes),
+        text="Faults are injected into a fleet in flight. Promises are judged by the vehicles' "
+        "true positions.",
+        data=_json(outcomes),
         rows=list(_rows(outcomes)),
         tables=[
             Table(("fault", "promise", "kept", "nearest its limit"), rows, note="\n".join(note))
@@ -107,11 +107,11 @@ def report_of(outcomes: Outcomes, made_by: Mapping[str, str]) -> Report:
 
 
 def _shown(figure: Figure) -> str:
-    """ "lands 2.4 s (at most 3.3)"."""
+    """Text such as "lands 2.4 s (at most 3.3)"."""
     unit = f" {figure.unit}" if figure.unit else ""
     value = f"{figure.value:.3g}" if math.isfinite(figure.value) else "never"
     if figure.value == math.inf and figure.at_least:
-        return f"{figure.name}: as wanted"
+        return f"{figure.name}: as required"
     how = "at least" if figure.at_least else "at most"
     return f"{figure.name} {value}{unit} ({how} {figure.limit:.3g})"
 
@@ -120,8 +120,8 @@ def _why(outcome: FlightOutcome) -> str:
     return outcome.error or "; ".join(map(_shown, outcome.broken))
 
 
-def _told(outcomes: Outcomes) -> dict[str, Any]:
-    """For scripts: each fault with its worst figures, and each flight that broke a promise."""
+def _json(outcomes: Outcomes) -> dict[str, Any]:
+    """For scripts: worst figures of each fault, and flights that broke a promise."""
     return {
         "faults": [
             {
@@ -165,7 +165,7 @@ def _rows(outcomes: Outcomes) -> Iterable[Sequence[object]]:
 
 
 def as_junit(outcomes: Outcomes) -> bytes:
-    """A test suite whose cases are the flights."""
+    """A JUnit test suite with a case per flight."""
     failed = [outcome for outcome in outcomes.values() if not outcome.held]
     suite = ElementTree.Element(
         "testsuite", name="lpac drill", tests=str(len(outcomes)), failures=str(len(failed))

@@ -1,4 +1,4 @@
-"""Drills: studies whose flights have a fault each, judged by the promises of that fault."""
+"""Drills: studies in which each flight has a fault, judged by the fault's promises."""
 
 import os
 import signal
@@ -28,20 +28,19 @@ from lpac.sim.sitl.build import require_build
 from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight, require_planned
 
 DrillEngine = Literal["simulated", "mavlink", "px4"]
-# A robot with its vehicle and its part of a ground takes 0.12 of a core, averaged over a flight.
+# CPU use of a robot with its vehicle and its share of a ground, averaged over a flight, is 0.12.
 _CORES_EACH = 0.16
 
-# Gets how many flights are done, of how many, and what is to be said of them.
+# Called with the numbers of flights done and planned, and a remark.
 Tell = Callable[[int, int, str], object]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drill(Bounded):
-    """Each of `faults`, or all that the engine flies, with so many `seeds` from `first_seed` on.
+    """Flights of each of `faults` (none: all that the engine can do), with seeds from `first_seed`.
 
-    `sensor` is the `type` in robot.toml's [sensor].
-
-    Raises ValueError that names what is impossible.
+    `sensor` is the `type` in robot.toml's [sensor]. Raises ValueError that names the impossible
+    value.
     """
 
     faults: tuple[str, ...] = ()
@@ -57,7 +56,7 @@ class Drill(Bounded):
         faults_of(self.faults, self.engine, "faults:")
 
     def flights(self, px4_build: Path | None = None) -> list[PlannedFlight]:
-        """All of them; those that share their begin beside each other.
+        """All flights; those with a common start are adjacent.
 
         Raises BundleError, ConfigError for the sensor, ValueError for PX4's build.
         """
@@ -66,7 +65,7 @@ class Drill(Bounded):
             if px4_build is None:
                 raise ValueError("engine = 'px4': needs PX4's build folder")
             px4 = str(require_build(px4_build).resolve())
-        # Flights of a scenario, and of the same settings, share their begin.
+        # Flights of one scenario with equal settings have a common start.
         faults = sorted(
             faults_of(self.faults, self.engine), key=lambda fault: (fault.exact, fault.settings)
         )
@@ -87,21 +86,21 @@ class Drill(Bounded):
 
 
 def faults_of(names: Sequence[str], engine: DrillEngine, where: str = "") -> list[Fault]:
-    """Those named, or all that the engine flies. Raises ValueError for one that it does not fly."""
+    """The named faults, or all that the engine can do. Raises ValueError for an unknown one."""
     for name in names:
         if name not in FAULTS:
-            raise ValueError(f"{where} {name}: there is none; `lpac drill --list` has all")
+            raise ValueError(f"{where} {name}: no such fault; `lpac drill --list` shows all")
     flown = [fault for fault in map(FAULTS.__getitem__, names or FAULTS) if flies(engine, fault)]
     if names and len(flown) < len(names):
         others = ", ".join(name for name in names if FAULTS[name] not in flown)
         raise ValueError(
-            f"{where} {others}: is not flown with {engine}; `lpac drill --list` tells what is"
+            f"{where} {others}: {engine} cannot do it; `lpac drill --list` shows which engines can"
         )
     return flown
 
 
 def read_drill(path: Path) -> Drill:
-    """A drill in a TOML file; the bundle's path counts from its folder.
+    """Read a drill from a TOML file; the bundle's path is relative to its folder.
 
     Raises ConfigError that names file, key, value and what is allowed.
     """
@@ -123,18 +122,16 @@ def fly_drill(
     pool: Pool = in_this_process,
     tell: Tell = lambda *_: None,
 ) -> dict[PlannedFlight, FlightOutcome]:
-    """Fly those of a drill that were not flown and kept in `folder`; by fault, and then by seed.
+    """Fly the flights without a stored outcome in `folder`; returns all, by fault, then seed.
 
-    On the simulated clock over a `pool`. In real time as many at once as this machine carries;
-    each leaves its logs and a figure in `folder`.
-
-    Raises OSError.
+    On the simulated clock they run in a `pool`; in real time, as many at once as this machine can
+    carry, and each leaves its logs and a figure in `folder`. Raises OSError.
     """
     one = flights[0]
     do = outcomes_of if one.engine == "simulated" else partial(_in_worker, folder=folder)
     kept = KeptFlights(folder, FlightOutcome, lambda outcome: not outcome.error)
     at_once = 1
-    # PX4's ports are the same for all fleets.
+    # All fleets use the same PX4 ports.
     if one.engine == "mavlink":
         at_once = int(len(os.sched_getaffinity(0)) / (_CORES_EACH * one.scenario.robots))
     beside = partial(over_processes, at_most=max(1, at_once))
@@ -155,9 +152,9 @@ def fly_drill(
 def outcomes_of(
     group: FlightGroup, folder: Path | None = None
 ) -> list[tuple[PlannedFlight, FlightOutcome]]:
-    """Fly a fault, in whatever process this is; logs and a figure stay in its part of `folder`.
+    """Fly one fault, in any process; logs and a figure are stored below `folder`.
 
-    Raises BundleError, and ValueError if another bundle is there now.
+    Raises BundleError, and ValueError if the bundle has changed.
     """
     [flight] = group
     require_planned(flight)
@@ -168,18 +165,18 @@ def outcomes_of(
         [record] = engine.fly([flight.scenario], Path(flight.bundle), logs)
         return record
 
-    # Thousands of flights say more than anybody reads.
+    # Logs of thousands of flights would be too long to read.
     show("error")
     if logs is None:
         return [(flight, outcome_of(fault, flown))]
-    # Whoever keeps nothing draws nothing.
+    # Without a folder, do not load what draws.
     from lpac.sim.drill.logged import fly_logged  # noqa: PLC0415
 
     return [(flight, fly_logged(fault, flown, logs))]
 
 
 def logs_of(flight: PlannedFlight, folder: Path) -> Path:
-    """Where a flight leaves its logs."""
+    """Folder of a flight's logs."""
     return folder / f"{flight.scenario.fault}-{flight.scenario.seed}"
 
 
@@ -188,5 +185,5 @@ def _in_worker(group: FlightGroup, folder: Path) -> list[tuple[PlannedFlight, Fl
     try:
         return outcomes_of(group, folder)
     except KeyboardInterrupt:
-        # Its programs have ended. A worker of a pool would go on with the next flight.
+        # Its programs have ended. Exit, or the pool's worker would start the next flight.
         os._exit(1)

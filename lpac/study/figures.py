@@ -23,7 +23,7 @@ _MOST_RIVALS = 4
 
 
 def cost_curves(condition: Condition, results: Sequence[MethodResult]) -> Figure:
-    """Each method's median cost over time; of policies with the band from 10 % to 90 %."""
+    """Each method's median cost over time; for policies with the band from 10 % to 90 %."""
     with style.figure(WIDTH_IN, 3.0) as figure:
         axes = figure.subplots()
         for result, (colour, dashes) in _looks(results):
@@ -51,7 +51,7 @@ def cost_curves(condition: Condition, results: Sequence[MethodResult]) -> Figure
 
 
 def distributions(condition: Condition, results: Sequence[MethodResult]) -> Figure:
-    """Performance profiles: how many worlds end below how much, in two measures."""
+    """Performance profiles: the share of worlds that end below a cost, in two measures."""
     with style.figure(WIDTH_IN, 3.0) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         for axes, measure, label in (
@@ -79,7 +79,7 @@ def distributions(condition: Condition, results: Sequence[MethodResult]) -> Figu
 
 
 def pairs(condition: Condition, results: Sequence[MethodResult]) -> Figure:
-    """World by world: the policies' cost at the end against that of the best other methods."""
+    """Final costs of policies against those of the best other methods, world by world."""
     policies = [result for result in results if result.method.trained] or [results[0]]
     others = [result for result in results if not any(result is policy for policy in policies)]
     rivals = sorted(others, key=lambda result: float(result.final.mean()))[:_MOST_RIVALS]
@@ -105,14 +105,14 @@ def pairs(condition: Condition, results: Sequence[MethodResult]) -> Figure:
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=7)
         figure.suptitle(
-            f"{condition.name}: $J$ at the end $/\\,J(0)$, a dot per world; below the line the "
+            f"{condition.name}: $J$ at the end $/\\,J(0)$, a dot per world; below the line, the "
             "policy is better", fontsize=8,
         )  # fmt: skip
         return figure
 
 
 def over_conditions(results: Mapping[Condition, Sequence[MethodResult]]) -> Figure:
-    """The mean cost at the end over clairvoyant's, under each condition, with 95 % intervals."""
+    """Mean final cost over clairvoyant's under each condition, with 95 % intervals."""
     with style.figure(WIDTH_IN, 3.2) as figure:
         axes = figure.subplots()
         methods = next(iter(results.values()))
@@ -139,7 +139,7 @@ def over_conditions(results: Mapping[Condition, Sequence[MethodResult]]) -> Figu
 
 
 def costs_by_world(records: Mapping[str, Mapping[str, FlightRecord]]) -> Figure:
-    """A panel for each world, a curve for each who flew; thin where vehicles truly were."""
+    """A panel for each world, a curve for each method; thin curves are true costs."""
     with style.figure(WIDTH_IN, 2.6) as figure:
         panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
         for axes, (world, of_world) in zip(panels, records.items(), strict=True):
@@ -152,7 +152,7 @@ def costs_by_world(records: Mapping[str, Mapping[str, FlightRecord]]) -> Figure:
                 if record.truth:
                     axes.plot(
                         record.curve_time_s, record.normalized_true, color=colour, lw=0.5,
-                        label=f"{name}, in truth",
+                        label=f"{name}, true",
                     )  # fmt: skip
             axes.set(title=world, xlabel="time (s)")
             tidy(axes)
@@ -165,7 +165,7 @@ def costs_by_world(records: Mapping[str, Mapping[str, FlightRecord]]) -> Figure:
 
 
 def perturbation(perturbed: PerturbedFlight) -> Figure:
-    """Cost, thin in truth, neighbours and speeds over time; shaded while a robot is away."""
+    """Cost (thin: true cost), neighbours and speeds over time; shaded while a robot is away."""
     record, absences = perturbed.record, perturbed.absences
     away = {absence.robot for absence in absences}
     with style.figure(WIDTH_IN, 4.6) as figure:
@@ -195,11 +195,11 @@ def perturbation(perturbed: PerturbedFlight) -> Figure:
             )  # fmt: skip
         legend = [
             ("cost, or the robots' mean", style.BLACK, 1.5),
-            ("a robot that is taken once", style.VERMILLION, 1.5),
+            ("a robot that is taken away", style.VERMILLION, 1.5),
             ("another robot", style.FAINT, 1.5),
         ]
         if record.truth:
-            legend.insert(1, ("cost, in truth", style.BLACK, 0.5))
+            legend.insert(1, ("true cost", style.BLACK, 0.5))
         handles = [cost.plot([], [], color=colour, lw=lw)[0] for _, colour, lw in legend]
         figure.legend(
             handles, [label for label, _, _ in legend], loc="outside upper center",
@@ -209,7 +209,7 @@ def perturbation(perturbed: PerturbedFlight) -> Figure:
 
 
 def _plain_ticks(axes: Axes) -> None:
-    """0.2, not 2 x 10^-1."""
+    """Label logarithmic axes with 0.2 instead of 2 x 10^-1."""
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":
             axis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))

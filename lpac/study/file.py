@@ -1,4 +1,4 @@
-"""Studies as TOML files; see `Study` for what the keys mean."""
+"""Reads studies from TOML files; `Study` defines the keys."""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -33,79 +33,78 @@ from lpac.study.worlds import SET_UPS, WorldSet
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyFile(Bounded):
-    """A study as its file has it; paths count from the file's folder.
+    """A study as in its file; paths are relative to the file's folder.
 
-    The shipped policy flies if no other and no baseline is named. `scenario` and each of
-    `conditions` have keys of `ConditionKeys` and of `Scenario`. In a condition, a list of values
-    where there should be one means a condition for each of them, and several such lists one for
-    each combination.
+    Without policies and baselines, the shipped policy flies. `scenario` and each of `conditions`
+    have keys of `ConditionKeys` and of `Scenario`. In a condition, a list in place of a single
+    value gives one condition per value; several lists give all combinations.
     """
 
-    title: Annotated[str, "Of the report; else the file's name."] = ""
-    text: Annotated[str, "What a reader of the report should know."] = ""
+    title: Annotated[str, "Title of the report; by default the file's name."] = ""
+    text: Annotated[str, "Introduction of the report."] = ""
     policies: Annotated[
         dict[str, tuple[str, ...]],
-        "By name the paths of its bundles, one per training; [] is the shipped one.",
+        "Paths of bundles by name, one per training; [] is the shipped one.",
     ] = field(default_factory=dict)
     baselines: Annotated[
-        tuple[BaselineName, ...], "Beside clairvoyant-cvt, which always flies."
+        tuple[BaselineName, ...], "In addition to clairvoyant-cvt, which always flies."
     ] = ()
-    world_set: Annotated[WorldSet, "Look at test only once."] = "validation"
+    world_set: Annotated[WorldSet, "Use test only once."] = "validation"
     first_world: Annotated[WorldNumber, "Number of the first world of the set."] = 0
-    worlds: Annotated[Worlds, "How many, from the first on."] = 20
+    worlds: Annotated[Worlds, "Number of worlds."] = 20
     starts: Annotated[
         Literal["own", "first"],
-        "Where robots start: in each world where its number says, or where the first one's do.",
+        "Each world has its own starts, or all have those of the first world.",
     ] = "own"
-    trials: Annotated[Trials, "How often each world is flown."] = 1
+    trials: Annotated[Trials, "Flights over each world."] = 1
     placed_within_m: Annotated[
-        Misplaced, "How far from the same starts robots are placed in each trial, m."
+        Misplaced, "Maximum distance of each trial's starts from the world's, m."
     ] = 0.0
     receiver_error_m: Annotated[
         tuple[Misplaced, Misplaced] | None,
-        "[least, greatest]: how wrong the positions of points are throughout a trial, m.",
+        "[least, greatest]: constant error of points' positions in a trial, m.",
     ] = None
-    scenario: Annotated[dict[str, object], "What all flights have alike: see below."] = field(
+    scenario: Annotated[dict[str, object], "Common to all flights: see below."] = field(
         default_factory=dict
     )
     conditions: Annotated[
-        tuple[dict[str, object], ...], Meta(min_length=1), "What is otherwise: see below."
+        tuple[dict[str, object], ...], Meta(min_length=1), "Differences: see below."
     ] = ({},)
-    figures: Annotated[tuple[Figure, ...], "Which are drawn."] = USUAL_FIGURES
+    figures: Annotated[tuple[Figure, ...], "Figures to draw."] = USUAL_FIGURES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConditionKeys(Bounded):
-    """Keys of a condition that are none of its scenario's."""
+    """Keys of a condition in addition to its scenario's."""
 
-    title: Annotated[str, "Its name in figures and tables; else what is otherwise."] = ""
+    title: Annotated[str, "Name in figures and tables; by default its differences."] = ""
     engine: Annotated[
         EngineName,
         "What flies the policies: points; whole robots on one simulated clock; a program for each "
         "robot in real time, on simulated vehicles or on real PX4s (--px4).",
     ] = "point"
     from_pads: Annotated[
-        bool, "Points begin on the pads of whole robots, as wrong about their places as these."
+        bool, "Points start on whole robots' pads, with the same position errors."
     ] = False
     lost: Annotated[str, "Points lost in flight, ROBOTS@SECONDS, such as 2@20."] = ""
     methods: Annotated[
         Annotated[tuple[str, ...], Meta(min_length=1)] | None,
-        "Names of those that fly it; else all.",
+        "Names of the methods that fly it; by default all.",
     ] = None
-    set_up: Annotated[
-        str, "Team and world, from which other keys differ: field, n32, paper, ..."
-    ] = "field"
-    world: Annotated[str, "Path of a world file; else worlds are drawn."] = ""
+    set_up: Annotated[str, "Team and world that other keys modify: field, n32, paper, ..."] = (
+        "field"
+    )
+    world: Annotated[str, "Path of a world file; by default worlds are drawn."] = ""
 
 
-# Keys of a scenario that the study says.
+# Keys of a scenario that the study sets.
 DRAWN = ("controller", "seed", "features", "scale")
 
 
 def read_study(
     path: Path, px4_build: Path | None = None, bundle: Path | str = SHIPPED_BUNDLE
 ) -> Study:
-    """The study in a file; `bundle` flies where a policy has no bundles of its own.
+    """Read a study; `bundle` flies for policies without bundles.
 
     Raises ConfigError that names file, key, value and what is allowed.
     """
@@ -123,7 +122,7 @@ def read_study(
         raise ConfigError(f"{where}: policies: {error}") from None
     for keys in _combinations(file.scenario, f"{where}: scenario"):
         condition_of(keys, f"{where}: scenario", path.parent)
-    # A condition given in two ways is flown once.
+    # Equal conditions are flown once.
     places: dict[Condition, str] = {}
     for number, changes in enumerate(file.conditions):
         place, whole = f"{where}: conditions[{number}]", merged(file.scenario, changes)
@@ -155,7 +154,7 @@ def read_study(
 
 
 def condition_of(keys: Mapping[str, object], where: str, folder: Path = Path()) -> Condition:
-    """A condition by its keys and those of its scenario. Raises ConfigError."""
+    """Make a condition from its own keys and those of its scenario. Raises ConfigError."""
     own_names = [each.name for each in fields(ConditionKeys)]
     own = from_mapping(ConditionKeys, {k: v for k, v in keys.items() if k in own_names}, where)
     if own.set_up not in SET_UPS:
@@ -187,59 +186,59 @@ def condition_of(keys: Mapping[str, object], where: str, folder: Path = Path()) 
 
 
 def _title(keys: Mapping[str, Any], whole: Mapping[str, Any], changes: Mapping[str, Any]) -> str:
-    """The given one, and what is otherwise; nothing if neither is."""
+    """The given title and the condition's differences; "" without either."""
     given = keys.get("title", "")
-    told = _otherwise(keys, whole, {} if given else changes)
-    return ", ".join(filter(None, [given, _said({**told, "title": ""})]))
+    changed = _differences(keys, whole, {} if given else changes)
+    return ", ".join(filter(None, [given, _text_of({**changed, "title": ""})]))
 
 
-def _otherwise(
+def _differences(
     keys: Mapping[str, Any], whole: Mapping[str, Any], changes: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Of one combination of `whole` those keys that are one of several values, or changes."""
-    told = {}
+    """Keys of one combination of `whole` that are in lists or `changes`."""
+    differing = {}
     for key, value in keys.items():
         if isinstance(value, Mapping):
-            told[key] = _otherwise(value, whole[key], changes.get(key, {}))
+            differing[key] = _differences(value, whole[key], changes.get(key, {}))
         elif key in changes or value != whole[key]:
-            told[key] = value
-    return told
+            differing[key] = value
+    return differing
 
 
-def _said(keys: Mapping[str, Any]) -> str:
-    """Keys and their values, for people."""
+def _text_of(keys: Mapping[str, Any]) -> str:
+    """Text of keys and values."""
     parts = []
     for key, value in keys.items():
-        said = f"{value:g}" if isinstance(value, float) else f"{value}"
-        said = _said(value) if isinstance(value, Mapping) else said
-        if said:
-            parts.append(said if key == "set_up" else f"{key} {said}")
+        text = f"{value:g}" if isinstance(value, float) else f"{value}"
+        text = _text_of(value) if isinstance(value, Mapping) else text
+        if text:
+            parts.append(text if key == "set_up" else f"{key} {text}")
     return ", ".join(parts)
 
 
 def merged(keys: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables key by key; all else replaces what was."""
-    told = dict(keys)
+    """Merge tables key by key; other values are replaced."""
+    result = dict(keys)
     for key, value in changes.items():
-        old = told.get(key)
+        old = result.get(key)
         both_tables = isinstance(old, Mapping) and isinstance(value, Mapping)
-        told[key] = merged(told[key], value) if both_tables else value
-    return told
+        result[key] = merged(result[key], value) if both_tables else value
+    return result
 
 
 def _combinations(
     keys: Mapping[str, Any], where: str, cls: type = Scenario
 ) -> Iterator[dict[str, Any]]:
-    """One for each combination of the values in lists that stand where one value should.
+    """Yield each combination of the values in lists that replace single values.
 
-    Raises ConfigError for a list of none.
+    Raises ConfigError for an empty list.
     """
     hints = {**get_type_hints(ConditionKeys), **get_type_hints(cls)}
     choices: list[list[tuple[str, Any]]] = []
     for key, value in keys.items():
         hint = hints.get(key)
         if value == [] and not _is_of_lists(hint):
-            raise ConfigError(f"{where}: {key} = []: must have a value at least")
+            raise ConfigError(f"{where}: {key} = []: must have at least one value")
         if isinstance(value, list) and not _is_of_lists(hint):
             choices.append([(key, each) for each in value])
         elif isinstance(value, Mapping) and is_dataclass(hint):
@@ -251,5 +250,5 @@ def _combinations(
 
 
 def _is_of_lists(hint: Any) -> bool:
-    """Whether a field's type has a list for its value."""
+    """Whether a field's type is a list."""
     return any(get_origin(each) is tuple for each in (hint, *get_args(hint)))

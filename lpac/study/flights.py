@@ -1,4 +1,4 @@
-"""The flights of a study: planned, flown in groups, and what came of them kept on disk."""
+"""Flights of a study: planned, flown in groups, and stored with their outcomes."""
 
 import hashlib
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -40,10 +40,10 @@ _FLIGHTS = "flights.jsonl"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedFlight:
-    """A scenario, the engine that flies it, and the bundle.
+    """A scenario, its engine, and the bundle.
 
-    `bundle` is the path of the one that flies, or that gives a baseline the sizes of sensor and
-    local map; `flown_by` is its id, or says these sizes. PX4s are those of `px4_build`.
+    `bundle` is the path of the flown bundle, or of the one that gives a baseline its sizes of
+    sensor and local map; `flown_by` is its id, or these sizes. `px4_build` is PX4's build folder.
     """
 
     scenario: Scenario
@@ -53,23 +53,22 @@ class PlannedFlight:
     px4_build: str = ""
 
     def flown_on(self) -> Engine:
-        """The engine itself. Raises ValueError for PX4s without their build."""
+        """The engine. Raises ValueError for PX4 without a build folder."""
         return engine_of(self.engine, Path(self.px4_build) if self.px4_build else None)
 
     @property
     def key(self) -> str:
-        """What tells it from all other flights, wherever the bundle and PX4 lie."""
+        """Identifies the flight, independent of the paths of bundle and PX4."""
         px4 = _px4_digest(self.px4_build) if self.engine == "px4" and self.px4_build else ""
-        told = repr((self.engine, self.flown_by, px4, self.scenario))
-        return hashlib.sha256(told.encode()).hexdigest()
+        text = repr((self.engine, self.flown_by, px4, self.scenario))
+        return hashlib.sha256(text.encode()).hexdigest()
 
 
 class CostCurve(NamedTuple):
-    """A cost (C,) at times (C,), s.
+    """A cost (C,) at times (C,), s: J of the present robots, in model units, or a task's own.
 
-    That is J, the coverage cost in model units of the robots that are left, or another task's.
-    `lloyd` is what the best of ten runs of Lloyd's algorithm, which know the world, come to from
-    the same starts: None but for flights of the clairvoyant.
+    `lloyd` is the best result of ten runs of Lloyd's algorithm, which know the world, from the same
+    starts; None except for clairvoyant flights.
     """
 
     time_s: tuple[float, ...]
@@ -77,14 +76,14 @@ class CostCurve(NamedTuple):
     lloyd: float | None = None
 
 
-# Flights that go together: those of one batch of the simulator, or one other.
+# Flights of one batch of the simulator, or a single other flight.
 FlightGroup = tuple[PlannedFlight, ...]
-# Flies a group, in whatever process it is, and says what came of each flight.
+# Flies a group, in any process, and returns the outcome of each flight.
 FlyGroup = Callable[[FlightGroup], list[tuple[PlannedFlight, Outcome]]]
 
 
 def task_of(bundle: Bundle) -> str:
-    """What policies must have in common to be compared. Raises BundleError without perception."""
+    """Properties that policies must share to be compared. Raises BundleError without perception."""
     perception, training = bundle.manifest.perception, bundle.manifest.training
     if perception is None:
         raise BundleError(f"bundle {bundle.manifest.name!r} has no perception: it cannot fly")
@@ -95,7 +94,7 @@ def task_of(bundle: Bundle) -> str:
 
 
 def sizes_of(bundle: Bundle) -> str:
-    """What baselines take from a bundle. Raises BundleError without perception."""
+    """Properties that baselines take from a bundle. Raises BundleError without perception."""
     task, perception = task_of(bundle), bundle.manifest.perception
     assert perception is not None
     unseen = perception.unknown_importance
@@ -103,7 +102,7 @@ def sizes_of(bundle: Bundle) -> str:
 
 
 def groups_of(flights: Iterable[PlannedFlight]) -> list[FlightGroup]:
-    """The flights in groups that go together, in about their order."""
+    """Group the flights, roughly in their order."""
     alike: dict[tuple[str, int], list[PlannedFlight]] = {}
     groups: list[FlightGroup] = []
     for flight in flights:
@@ -124,17 +123,17 @@ def _robot_seconds(group: FlightGroup) -> float:
 
 
 def require_planned(flight: PlannedFlight) -> None:
-    """Raise ValueError if another bundle is at its path than when the flight was planned."""
+    """Raise ValueError if the bundle at its path is not the planned one."""
     if loaded_bundle(flight.bundle).id != flight.flown_by:
-        raise ValueError(f"{flight.bundle}: is another bundle by now, or on this machine")
+        raise ValueError(f"{flight.bundle}: differs from the planned bundle")
 
 
 def records_of(
     group: FlightGroup, logs: Path | None = None
 ) -> list[tuple[PlannedFlight, FlightRecord]]:
-    """Fly them, in whatever process this is; what programs leave is kept in a folder in `logs`.
+    """Fly a group, in any process; files of programs are stored in a folder below `logs`.
 
-    Raises BundleError, ValueError, OSError, and what `lpac sim` does of programs in real time.
+    Raises BundleError, ValueError, OSError, and for programs in real time the errors of `lpac sim`.
     """
     first = group[0]
     if first.scenario.controller == POLICY:
@@ -147,12 +146,12 @@ def records_of(
 
 
 def curves_of(group: FlightGroup) -> list[tuple[PlannedFlight, CostCurve]]:
-    """Fly them as `records_of` does, and keep no more than the costs."""
+    """Fly a group as `records_of` does, and return only the costs."""
     return [(flight, curve_of(flight, record)) for flight, record in records_of(group)]
 
 
 def curve_of(flight: PlannedFlight, record: FlightRecord) -> CostCurve:
-    """The cost over a flight, of where robots and vehicles truly are."""
+    """Cost over a flight, at true positions."""
     time_s = cost_times_s(flight.scenario.duration_s)
     true_cost = record.true_cost if record.truth else record.cost
     cost = np.interp(time_s, record.curve_time_s, true_cost)
@@ -166,10 +165,10 @@ def fly_all(
     pool: Pool,
     in_real_time: Pool = in_this_process,
 ) -> Generator[tuple[PlannedFlight, Outcome], None, None]:
-    """Each flight as it is done, with what `do` makes of its group.
+    """Fly all groups; yields each flight's outcome.
 
-    The largest groups are begun first, so that in the end no core waits long for another. Flights
-    in real time have a pool of their own, and nothing of the other beside them.
+    The largest groups begin first, so that no core idles long at the end. Flights in real time use
+    their own pool, after all others.
     """
     groups: dict[bool, list[FlightGroup]] = {False: [], True: []}
     for group in sorted(groups_of(flights), key=_robot_seconds, reverse=True):
@@ -181,7 +180,7 @@ def fly_all(
 
 
 class KeptFlights(Generic[Outcome]):
-    """What came of flights, in a folder: who asks again for one that was flown there has it."""
+    """Outcomes of flights, stored in a folder and reused."""
 
     def __init__(
         self,
@@ -189,9 +188,9 @@ class KeptFlights(Generic[Outcome]):
         kind: type[Outcome],
         is_kept: Callable[[Outcome], bool] = lambda _: True,
     ) -> None:
-        """Outcomes are named tuples of this kind: a folder has those of one alone.
+        """`kind` is the outcomes' named tuple; a folder has one kind only.
 
-        What `is_kept` does not want is flown again. Raises OSError.
+        Outcomes that fail `is_kept` are not stored. Raises OSError.
         """
         self._is_kept = is_kept
         self._kept = KeptOutcomes(folder / _FLIGHTS, {"code": code_digest(edge, lpac)})
@@ -200,15 +199,15 @@ class KeptFlights(Generic[Outcome]):
         }
 
     def known(self, flights: Iterable[PlannedFlight]) -> dict[PlannedFlight, Outcome]:
-        """Those of them that were flown before."""
+        """Stored outcomes of these flights."""
         return {each: self._outcomes[each.key] for each in flights if each.key in self._outcomes}
 
     def keep(self, flight: PlannedFlight, outcome: Outcome) -> None:
-        """What came of one more. Raises OSError."""
+        """Store an outcome. Raises OSError."""
         if self._is_kept(outcome) and flight.key not in self._outcomes:
             self._outcomes[flight.key] = outcome
-            told = {"flight": flight.key, "fault": flight.scenario.fault}
-            self._kept.add({**told, "seed": flight.scenario.seed, "outcome": outcome})
+            line = {"flight": flight.key, "fault": flight.scenario.fault}
+            self._kept.add({**line, "seed": flight.scenario.seed, "outcome": outcome})
 
     def fly(
         self,
@@ -217,7 +216,7 @@ class KeptFlights(Generic[Outcome]):
         pool: Pool,
         in_real_time: Pool = in_this_process,
     ) -> Generator[tuple[PlannedFlight, Outcome], None, None]:
-        """All of them: first what was flown before, and then the others as they come."""
+        """Yield stored outcomes first, then those of the other flights as they end."""
         known = self.known(flights)
         yield from known.items()
         missing = [flight for flight in flights if flight not in known]

@@ -1,4 +1,4 @@
-"""Flights from which robots are taken, and to which they come back."""
+"""Flights in which robots are taken away and brought back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from lpac.analysis.flight import FlightRecord
 from lpac.sim.points import SAMPLE_S
 from lpac.sim.scenario import Scenario
 
-# Settled is what stays within so much of what it comes to in the end.
+# A cost has settled when it stays within this share of its final value.
 _SETTLED = 0.05
 
 
 class Absence(NamedTuple):
-    """A robot was taken away, and brought back; s."""
+    """Time in which a robot was away; s."""
 
     robot: str
     from_s: float
@@ -25,7 +25,7 @@ class Absence(NamedTuple):
 
 
 def absences_of(record: FlightRecord) -> list[Absence]:
-    """When pilots had robots, in the mission."""
+    """Times in the mission in which pilots flew robots."""
     piloted = [
         Absence(robot.name, interval.begin_s, min(interval.end_s, record.duration_s))
         for robot in record.robots
@@ -36,10 +36,10 @@ def absences_of(record: FlightRecord) -> list[Absence]:
 
 
 class Phase(NamedTuple):
-    """A robot is away, or back; the costs are over that at the start.
+    """A time with a robot away, or back; costs are over the initial cost.
 
-    `settled_s` is how long after the phase began the cost last was further than 5 % from what it
-    came to at its end.
+    `settled_s` is the time from the phase's begin until the cost stayed within 5 % of its last
+    value.
     """
 
     robot: str
@@ -54,9 +54,9 @@ class Phase(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PerturbedFlight:
-    """A flight from which robots were taken, at times (T,), s.
+    """A flight from which robots were taken, sampled at times (T,), s.
 
-    `speed_m_s` and `neighbours` are (T, N), NaN of robots that are away.
+    `speed_m_s` and `neighbours` are (T, N), NaN while a robot is away.
     """
 
     record: FlightRecord
@@ -70,9 +70,9 @@ class PerturbedFlight:
 def perturbed_by(
     record: FlightRecord, absences: Sequence[Absence], range_m: float
 ) -> PerturbedFlight:
-    """What a flight says in which robots were away, one after another.
+    """Evaluate a flight in which robots were away, one after another.
 
-    Neighbours are those within `range_m`. Raises ValueError if nobody was.
+    Neighbours are within `range_m`. Raises ValueError if no robot was away.
     """
     if not absences:
         raise ValueError(f"{record.name}: no pilot took a robot in the mission")
@@ -85,7 +85,7 @@ def perturbed_by(
     speed_m_s = np.full(present.shape, np.nan)
     for robot, here in enumerate(present.T):
         if here.sum() > 1:
-            # Across a gap it is on the straight way.
+            # Interpolate linearly across gaps.
             path_m = np.stack(
                 [np.interp(time_s, time_s[here], places_m[here, robot, k]) for k in (0, 1)], axis=1
             )
@@ -111,7 +111,7 @@ def perturbed_by(
 def _phase(
     record: FlightRecord, robot: str, *, away: bool, from_s: float, until_s: float
 ) -> Phase | None:
-    """None if it was too short for a cost."""
+    """None if the phase is too short for a cost."""
     times_s, cost = record.curve_time_s, record.normalized
     before, inside = cost[times_s < from_s], (times_s >= from_s) & (times_s < until_s)
     if not inside.any() or not len(before):
@@ -131,5 +131,5 @@ def _phase(
 
 
 def absences_in(scenario: Scenario) -> list[Absence]:
-    """When points fail that come back; they are named by their numbers."""
+    """Times in which points fail and return, with the points' numbers as names."""
     return [Absence(str(f.robot), f.from_s, f.until_s) for f in scenario.failures]

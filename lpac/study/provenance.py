@@ -1,4 +1,4 @@
-"""What made an experiment: its command, its policies, what was drawn, and versions."""
+"""Provenance of an experiment: command, policies, draws, and versions."""
 
 import platform
 from collections.abc import Mapping, Sequence
@@ -14,10 +14,10 @@ from lpac.study.study import Study
 def made_by(
     command: str, bundle_ids: Sequence[str], drawn: Mapping[str, str] | None = None
 ) -> dict[str, str]:
-    """By what it is called; `drawn` says which worlds, or which seeds."""
-    told = {"command": f"lpac {command}", "bundle": ", ".join(bundle_ids), **(drawn or {})}
+    """Provenance by name; `drawn` has the worlds or seeds."""
+    entries = {"command": f"lpac {command}", "bundle": ", ".join(bundle_ids), **(drawn or {})}
     return {
-        **{what: value for what, value in told.items() if value},
+        **{what: value for what, value in entries.items() if value},
         "lpac-edge": f"{version('lpac-edge')}, code {code_digest(edge, lpac)[:12]}",
         "python": platform.python_version(),
         **{package: version(package) for package in ("numpy", "onnxruntime")},
@@ -25,7 +25,7 @@ def made_by(
 
 
 def made_by_study(command: str, study: Study) -> dict[str, str]:
-    """The same of a study's bundles and worlds."""
+    """Provenance of a study, with its bundles and worlds."""
     ids = [each.bundle_id for method in study.methods for each in method.trainings]
     first, last = study.draws[0].world, study.draws[-1].world
     policies = [
@@ -38,6 +38,6 @@ def made_by_study(command: str, study: Study) -> dict[str, str]:
 
 
 def _from_here(path: str) -> str:
-    """Of what is below the working directory nothing that is of this machine alone."""
+    """Make a path below the working directory relative, without anything of this machine."""
     here = Path.cwd()
     return str(Path(path).relative_to(here)) if Path(path).is_relative_to(here) else path

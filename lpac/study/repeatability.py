@@ -1,4 +1,4 @@
-"""Trials of one flight, and how they differ."""
+"""Compares trials of one flight."""
 
 import math
 from collections.abc import Mapping
@@ -12,10 +12,10 @@ from lpac.analysis.flight import COST_PERIOD_S, FlightRecord
 
 
 def looked_at_from_s(trials: Mapping[str, FlightRecord], duration_s: float) -> dict[str, float]:
-    """When to begin to look at each trial for so long, by name; s, in the trial's own time.
+    """Start of the evaluated time of each trial, by name; s, in the trial's own time.
 
-    That is the takeoff command, or for all trials the mission's start, 0, if one of them has none,
-    as points have not, or had it longer before.
+    The start is the takeoff command. It is 0, the mission's start, for all trials if one of them
+    has no takeoff (points), or an earlier one than `duration_s` before.
     """
     found_s = {name: _takeoff_s(record) for name, record in trials.items()}
     if any(not -duration_s < at_s <= 0.0 for at_s in found_s.values()):
@@ -24,7 +24,7 @@ def looked_at_from_s(trials: Mapping[str, FlightRecord], duration_s: float) -> d
 
 
 def _takeoff_s(record: FlightRecord) -> float:
-    """When the first robot armed, which is what a takeoff command makes of it; NaN if none did."""
+    """Time of the takeoff command, when the first robot arms; NaN without one."""
     armed_s = [
         time_s
         for robot in record.robots
@@ -35,9 +35,9 @@ def _takeoff_s(record: FlightRecord) -> float:
 
 
 def looked_at(record: FlightRecord, from_s: float, duration_s: float) -> FlightRecord:
-    """A trial from a time on for so long, or as much as there is; times count from it.
+    """Part of a trial of at most `duration_s`, with times relative to `from_s`.
 
-    Before the mission robots count for the cost where they stand, too.
+    Before the mission, robots on the ground also count for the cost.
     """
     end_s = min(duration_s, record.duration_s - from_s)
     robots = tuple(
@@ -61,10 +61,10 @@ def looked_at(record: FlightRecord, from_s: float, duration_s: float) -> FlightR
 
 
 def spread_of(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
-    """How the costs at the end of the shortest, and the places there, differ.
+    """Differences of costs and positions at the end of the shortest trial.
 
-    Places are compared of the robots that were in the air there in all trials; `missing` are the
-    others, by trial. Raises ValueError if nobody was in all.
+    Positions are compared for robots in the air in all trials; `missing` names the others by trial.
+    Raises ValueError if there are none in common.
     """
     end_s = min(float(record.curve_time_s[-1]) for record in records.values())
     times_s = np.append(np.arange(0.0, end_s, 1.0), end_s)
@@ -91,8 +91,8 @@ def spread_of(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
 
 
 def who_is_missing(spread: Mapping[str, Any]) -> list[str]:
-    """A sentence for each trial of `spread_of` in which a robot is missing."""
+    """A sentence for each trial of `spread_of` with missing robots."""
     return [
-        f"At the end of {trial} not in the air, and so not compared: {', '.join(names)}."
+        f"Not compared, because not in the air at the end of {trial}: {', '.join(names)}."
         for trial, names in spread["missing"].items()
     ]

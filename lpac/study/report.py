@@ -1,4 +1,4 @@
-"""What a study leaves in its folder: figures, NAME.json, NAME.csv, and README.md."""
+"""A study's report: figures, NAME.json, NAME.csv, and README.md."""
 
 import csv
 import json
@@ -11,7 +11,7 @@ from lpac.analysis.template import render
 
 
 class Table(NamedTuple):
-    """A table with a row of headings; `title` stands above it, `note` below."""
+    """A table with a row of headings; `title` is above it, `note` below."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -20,7 +20,7 @@ class Table(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A figure in the report's folder, and what it shows."""
+    """A figure in the report's folder, and its caption."""
 
     file: str
     caption: str
@@ -28,17 +28,17 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """What is told of an experiment.
+    """Content of a report.
 
-    The `legend` explains all tables. `told` is for scripts, `rows` are the CSV's, its heading
-    first. `flown` says how it was flown, `made_by` what made it: command, policies, versions.
-    `beside` says, in Markdown, what else is in the folder.
+    `legend` explains all tables. `data` is for the JSON, `rows` for the CSV, with its heading
+    first. `flown` describes the engine, `made_by` the provenance: command, policies, versions.
+    `beside` describes, in Markdown, other files in the folder.
     """
 
     name: str
     title: str
     text: str
-    told: Mapping[str, Any]
+    data: Mapping[str, Any]
     rows: Sequence[Sequence[object]]
     tables: Sequence[Table]
     figures: Sequence[Picture]
@@ -49,20 +49,20 @@ class Report:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The JSON."""
-        return {**self.told, "flown": self.flown, "made_by": dict(self.made_by)}
+        """Content of the JSON file."""
+        return {**self.data, "flown": self.flown, "made_by": dict(self.made_by)}
 
     def write(self, folder: Path) -> dict[str, Any]:
-        """NAME.json, NAME.csv and README.md; gives the JSON. Raises OSError."""
+        """Write NAME.json, NAME.csv and README.md; returns the JSON. Raises OSError."""
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{self.name}.json").write_text(json.dumps(self.document, indent=2) + "\n")
         write_csv(self.rows, folder / f"{self.name}.csv")
-        told = {name: getattr(self, name) for name in self.__slots__}
-        (folder / "README.md").write_text(render("lpac.study", "report.md", **told))
+        fields = {name: getattr(self, name) for name in self.__slots__}
+        (folder / "README.md").write_text(render("lpac.study", "report.md", **fields))
         return self.document
 
 
 def write_csv(rows: Sequence[Sequence[object]], path: Path) -> None:
-    """Raises OSError."""
+    """Write a CSV file. Raises OSError."""
     with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)

@@ -1,14 +1,14 @@
-"""Results of a study: what methods came to over its worlds, and how surely they differ.
+"""Results of a study: costs of methods over its worlds, and their comparison.
 
-Costs are normalised by a world's at the start, with all robots. What the numbers mean:
+Costs are normalised by the world's initial cost with all robots. Definitions:
 
-- **final** is the cost at the end, **area** the mean over the flight: the area under the curve over
-  its duration.
-- **x clairvoyant** and **x best of ten** are over what ClairvoyantCVT comes to in the same world in
-  the same time, and over the best of ten runs of Lloyd's algorithm on the true density. Neither is
-  a bound. Of values over all worlds it is the ratio of the means; else world by world.
+- **final** is the cost at the end, **area** the mean over the flight (the area under the curve over
+  the duration).
+- **x clairvoyant** and **x best of ten** are relative to ClairvoyantCVT in the same world and time,
+  and to the best of ten runs of Lloyd's algorithm on the true density. Neither is a bound. Over all
+  worlds they are ratios of means, else world by world.
 - A world **fails** if it ends above `FAILS_ABOVE` x clairvoyant. Costs **rise again** if they end
-  more than 5 % above their own least.
+  more than 5 % above their own minimum.
 - Where robots are lost in flight, baselines and Lloyd's algorithm never had them.
 """
 
@@ -43,8 +43,8 @@ _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
 class MethodResult:
     """Costs of a method under one condition, in S trainings over K worlds.
 
-    `time_s` (C,), and `curves` (S, K, C): the normalised cost then. `clairvoyant` and `best_of_ten`
-    (1, K) are the normalised costs that it is held against. `lost_at_s` is when robots were lost.
+    `time_s` (C,), `curves` (S, K, C) are normalised costs. `clairvoyant` and `best_of_ten` (1, K)
+    are the normalised costs for comparison. `lost_at_s` is the time at which robots are lost.
     """
 
     method: Method
@@ -76,7 +76,7 @@ class MethodResult:
 
     @property
     def rises_again(self) -> Bools:
-        """(S, K); since robots were lost, if any were."""
+        """(S, K); after the loss of robots, if there is one."""
         since = self.curves[..., self.time_s >= self.lost_at_s]
         risen: Bools = self.final > _RISEN * since.min(axis=-1)
         return risen
@@ -85,7 +85,7 @@ class MethodResult:
 def results_of(
     study: Study, curves: Mapping[PlannedFlight, CostCurve]
 ) -> dict[Condition, list[MethodResult]]:
-    """Of all its flights: under each condition each method's result, in the study's order."""
+    """Results of all methods under each condition, in the study's order."""
     return {condition: _of_condition(study, condition, curves) for condition in study.conditions}
 
 
@@ -105,7 +105,7 @@ def _of_condition(
         for name, its in flown.items()
     }
     best_of_ten = np.array([[flight.lloyd for flight in its] for its in flown[CLAIRVOYANT]]).T
-    # Baselines begin without those who are lost later, and so with more cost.
+    # Baselines start without the robots that are lost later, and so at a higher cost.
     initial = np.min([its[:, :, 0].min(axis=0) for its in costs.values()], axis=0)
     return [
         MethodResult(
@@ -123,7 +123,7 @@ def _of_condition(
 def as_json(
     study: Study, results: Mapping[Condition, Sequence[MethodResult]], *, compared: bool = False
 ) -> dict[str, Any]:
-    """All numbers, for scripts; `compared` sets the first method against the second."""
+    """All numbers for scripts; `compared` adds a comparison of the first method with the second."""
     return {
         "world_set": study.world_set,
         "first_world": study.first_world,
@@ -142,7 +142,7 @@ def as_json(
 def conditions_json(
     results: Mapping[Condition, Sequence[MethodResult]], *, compared: bool = False
 ) -> list[dict[str, Any]]:
-    """What each method came to under each condition; see `as_json`."""
+    """Results of all methods under each condition; see `as_json`."""
     return [
         {
             "name": condition.name,
@@ -161,17 +161,17 @@ def conditions_json(
 
 
 def scenario_json(scenario: Scenario) -> dict[str, Any]:
-    """All but what is drawn for each world; and what messages suffer."""
-    told = asdict(replace(scenario, features=None))
+    """A scenario without what is drawn for each world, and the quality of its links."""
+    keys = asdict(replace(scenario, features=None))
     drawn = ("features", "seed", "controller")
     return {
-        **{name: value for name, value in told.items() if name not in drawn},
+        **{name: value for name, value in keys.items() if name not in drawn},
         "link": scenario.link._asdict(),
     }
 
 
 def verdict_of(a: MethodResult, b: MethodResult) -> Verdict:
-    """By the cost at the end."""
+    """Comparison by the final cost."""
     return compare(a.final, b.final, trained_a=a.method.trained, trained_b=b.method.trained)
 
 
@@ -223,7 +223,7 @@ def _result_json(result: MethodResult, of_all: Iterable[MethodResult]) -> dict[s
 
 
 def _distribution(values: F64) -> dict[str, Any]:
-    """Of (S, K); intervals as [value, low, high]."""
+    """Distribution of (S, K) values; intervals as [value, low, high]."""
     worst = np.unravel_index(values.argmax(), values.shape)
     return {
         "mean": list(bootstrap(values)),
@@ -236,9 +236,9 @@ def _distribution(values: F64) -> dict[str, Any]:
 
 
 def _share_json(failed: Bools) -> dict[str, Any]:
-    """How many of (S, K) bools, and how many in truth at most, at 95 % confidence.
+    """Share of true values in (S, K), and its upper bound at 95 % confidence.
 
-    Flights of several trainings over one world are not independent: so the bound counts worlds,
+    Flights of several trainings over one world are not independent, so the bound counts worlds,
     each with the share of its trainings.
     """
     of, share = failed.shape[1], float(failed.mean())
@@ -250,6 +250,6 @@ def _share_json(failed: Bools) -> dict[str, Any]:
 
 
 def worst_worlds(result: MethodResult, count: int) -> list[int]:
-    """Positions among the study's worlds where it ends highest over clairvoyant, on average."""
+    """Indices of the study's worlds with the highest mean final cost over clairvoyant."""
     ascending = np.argsort(result.over_clairvoyant.mean(axis=0), kind="stable")
     return [int(world) for world in ascending[::-1][:count]]

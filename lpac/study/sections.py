@@ -28,10 +28,10 @@ _SNAPSHOTS_S = (0.0, 0.25, 0.5, 1.0)
 class Section:
     """What a report tells of flights.
 
-    `told` is for scripts, `rows` are the CSV's, its heading first.
+    `data` is for scripts, `rows` are the CSV's, its heading first.
     """
 
-    told: Mapping[str, Any]
+    data: Mapping[str, Any]
     tables: Sequence[Table]
     figures: Sequence[Picture]
     rows: Sequence[Sequence[object]]
@@ -39,7 +39,7 @@ class Section:
     def report(self, name: str, title: str, flown: str, made_by: Mapping[str, str]) -> Report:
         """A report of this alone; `flown` and `made_by` are `Report`'s."""
         return Report(
-            name=name, title=title, text=flown, told=self.told, rows=self.rows,
+            name=name, title=title, text=flown, data=self.data, rows=self.rows,
             tables=self.tables, figures=self.figures, flown=flown, made_by=made_by,
         )  # fmt: skip
 
@@ -156,9 +156,9 @@ def perturbation(flight: PerturbedFlight, folder: Path) -> Section:
 
 def _final(record: FlightRecord) -> str:
     """With the true one in brackets where vehicles tell."""
-    told = curves_json({"": record})[""]
-    known = record.truth and told["final_true"] is not None
-    return f"{told['final']:.3f}" + (f" ({told['final_true']:.3f})" if known else "")
+    curve = curves_json({"": record})[""]
+    known = record.truth and curve["final_true"] is not None
+    return f"{curve['final']:.3f}" + (f" ({curve['final_true']:.3f})" if known else "")
 
 
 def true_curve(record: FlightRecord) -> F64:
@@ -193,7 +193,7 @@ def _known(value: float) -> float | None:
 def curves_csv(records: Mapping[str, FlightRecord]) -> list[list[object]]:
     """A heading, and a row for each flight and time; a true cost that is not known is empty."""
     rows: list[list[object]] = [["flight", "time_s", "cost_over_first", "true_cost_over_first"]]
-    for name, told in curves_json(records).items():
-        curves = (told["time_s"], told["normalized_cost"], told["normalized_true_cost"])
+    for name, curve in curves_json(records).items():
+        curves = (curve["time_s"], curve["normalized_cost"], curve["normalized_true_cost"])
         rows += [[name, *row] for row in zip(*curves, strict=True)]
     return rows

@@ -1,6 +1,6 @@
 """A study: policies and baselines over the worlds of a set, under conditions.
 
-It is a TOML file (docs/research.md has one), or made in Python. Its flights follow from it.
+Studies are TOML files (docs/research.md has one), or made in Python.
 """
 
 from collections.abc import Iterator
@@ -33,23 +33,23 @@ Figure = Literal[
     "curves", "distributions", "pairs", "conditions", "worst", "snapshots", "repeatability",
     "perturbation", "rates",
 ]  # fmt: skip
-# Those of a study that does not say.
+# Default of a study.
 USUAL_FIGURES: tuple[Figure, ...] = ("curves", "distributions", "pairs", "conditions", "worst")
-# Those of whole flights, and not of their costs alone.
+# Figures that need records of whole flights, not only costs.
 _OF_RECORDS = ("snapshots", "repeatability", "perturbation")
 
 
 Worlds = Annotated[int, Meta(ge=1, le=10_000)]
 Trials = Annotated[int, Meta(ge=1, le=1000)]
 WorldNumber = Annotated[int, Meta(ge=0, le=1_000_000)]
-# How wrong a place may be, m.
+# Distance of a position from its true place, m.
 Misplaced = Annotated[float, Meta(ge=0.0, le=1000.0)]
-# In bytes: figures are in folders of these names.
+# In bytes: folders of figures have these names.
 _LONGEST_NAME = 200
 
 
 class ConditionError(ValueError):
-    """No flight can be made under a condition of a study."""
+    """A condition of a study under which no flight is possible."""
 
     def __init__(self, condition: "Condition", text: str) -> None:
         super().__init__(text)
@@ -57,14 +57,14 @@ class ConditionError(ValueError):
 
 
 class Draw(NamedTuple):
-    """A world of the set, by its number, and which of the trials in it."""
+    """A world of the set, by number, and a trial over it."""
 
     world: int
     trial: int = 0
 
 
 class TrainedBundle(NamedTuple):
-    """A bundle: its path, and its id."""
+    """Path and id of a bundle."""
 
     path: str
     bundle_id: str
@@ -72,9 +72,9 @@ class TrainedBundle(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """A baseline, or a policy by the bundles of its trainings, which differ in their seed alone.
+    """A baseline, or a policy with the bundles of its trainings, which differ only in their seed.
 
-    Raises ValueError for a policy with an impossible name, or a baseline's.
+    Raises ValueError for an invalid name of a policy, or a baseline's name.
     """
 
     name: str
@@ -83,18 +83,18 @@ class Method:
     def __post_init__(self) -> None:
         _require_name("name", self.name)
         if self.trainings and self.name in BASELINES:
-            raise ValueError(f"name = {self.name!r}: must be another, since a baseline has it")
+            raise ValueError(f"name = {self.name!r}: is a baseline's: choose another")
 
     @property
     def trained(self) -> bool:
-        """Whether it is no baseline."""
+        """Whether it is a policy."""
         return bool(self.trainings)
 
     @classmethod
     def of(cls, name: str, *bundles: Path | str) -> "Method":
-        """A policy by the paths of its bundles, or the baseline of that name if there are none.
+        """A policy by the paths of its bundles, or without bundles the baseline of that name.
 
-        Raises BundleError; ValueError for a name that is no baseline's.
+        Raises BundleError; ValueError for an unknown baseline.
         """
         if not bundles and name not in BASELINES:
             raise ValueError(f"baseline {name!r}: must be one of {', '.join(BASELINES)}")
@@ -104,15 +104,14 @@ class Method:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Condition:
-    """What flights have alike under which all methods fly.
+    """Common properties of the flights of all methods.
 
-    `scenario` has their sizes; its world, starts and seed are drawn for each world of the set,
-    unless it has features of its own. `engine` flies the policies; baselines are points. Points
-    begin `from_pads`, on which whole robots would stand, and are as wrong about their places as
-    these. The last robots are `lost` in flight; baselines never had them. With `methods` it is
-    flown by those of these names alone.
+    `scenario` has the sizes; its world (unless it has features), starts and seed are drawn for each
+    world of the set. `engine` flies the policies; baselines are points. With `from_pads` points
+    start on whole robots' pads, with their position errors. The last robots are `lost` in flight;
+    baselines never had them. `methods` names the methods that fly; all if empty.
 
-    Raises ValueError that names what is impossible.
+    Raises ValueError that names the impossible value.
     """
 
     scenario: Scenario = field(default_factory=FIELD.scenario)
@@ -141,24 +140,24 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """For people: its title, or else its set-up and what is otherwise than usual."""
+        """Title for people; by default the set-up and its differences."""
         return self.title or ", ".join([self.set_up, *self._differences()])
 
     @property
     def folder(self) -> str:
-        """Of its figures, within the study's."""
-        kept = self.name.replace(",", "").replace("%", "percent")
-        return kept.replace(" ", "-").replace("/", "-")
+        """Name of the folder of its figures."""
+        name = self.name.replace(",", "").replace("%", "percent")
+        return name.replace(" ", "-").replace("/", "-")
 
     @property
     def set_up(self) -> str:
-        """By its name; or its sizes, if it has none."""
+        """Name of the set-up, or its sizes if it has none."""
         own = SetUp.of(self.scenario)
         return next((name for name, known in SET_UPS.items() if known == own), self.sizes)
 
     @property
     def sizes(self) -> str:
-        """In words."""
+        """Description of the sizes."""
         own, features = SetUp.of(self.scenario), self.scenario.features
         count = own.features if features is None else len(features)
         return (
@@ -187,22 +186,22 @@ class Condition:
         usual = FIELD.scenario()
         for each in fields(Scenario):
             value = getattr(scenario, each.name)
-            if each.name not in _SAID and value != getattr(usual, each.name):
+            if each.name not in _IN_NAME and value != getattr(usual, each.name):
                 yield f"{each.name} = {_short(value)}"
         if self.engine != "point":
             yield _ENGINES[self.engine]
 
 
 def _require_name(key: str, name: str) -> None:
-    """Raise ValueError for what cannot be a folder's name, or stand in a figure."""
+    """Raise ValueError for a name that cannot be a folder's or a figure's."""
     if (
         not name.isprintable() or name.startswith(".") or "$" in name
         or not 0 < len(name.encode()) <= _LONGEST_NAME
     ):  # fmt: skip
         shown = f"{name[:60]}..." if len(name) > 60 else name
         raise ValueError(
-            f"{key} = {shown!r}: must be 1 to {_LONGEST_NAME} letters on one line, without $, and "
-            "begin with no dot"
+            f"{key} = {shown!r}: must be 1 to {_LONGEST_NAME} letters on one line, without $ and "
+            "leading dot"
         )
 
 
@@ -211,8 +210,8 @@ _ENGINES: dict[EngineName, str] = {
     "mavlink": "whole robots, as programs",
     "px4": "whole robots, on PX4",
 }
-# Of a scenario, what `Condition.name` says in words, or what is drawn.
-_SAID = {
+# Keys of a scenario that `Condition.name` has in words, or that are drawn.
+_IN_NAME = {
     "controller", "robots", "seed", "duration_s", "world_size", "communication_range",
     "random_feature_count", "random_feature_sigma", "loss", "radio", "lag_s", "position_error_m",
     "payload", "scale", "failures",
@@ -220,7 +219,7 @@ _SAID = {
 
 
 def _short(value: object) -> str:
-    """A value; of a dataclass what is otherwise than by default."""
+    """Text of a value; for a dataclass, of its differences from the defaults."""
     if not hasattr(value, "__dataclass_fields__"):
         return f"{value:g}" if isinstance(value, float) else f"{value}"
     usual = type(value)()
@@ -232,17 +231,16 @@ def _short(value: object) -> str:
 class Study(Bounded):
     """Policies over `worlds` worlds of a set from `first_world` on, under each condition.
 
-    In each world robots start where its number says, or in all where the `first` one's robots do,
-    with the same receivers and the same wind if they are whole. Each world is flown in so many
-    `trials`, which differ in all that is drawn but the world: starts are within `placed_within_m`
-    of the same places, and the positions of points are wrong by `receiver_error_m` (least,
-    greatest) throughout.
+    Each world has its own starts, or all have those of the `first` one, and with whole robots also
+    the same receivers and wind. Each world is flown in `trials`, which differ in everything drawn
+    except the world: starts are within `placed_within_m` of the world's, and positions of points
+    are off by a constant `receiver_error_m` (least, greatest).
 
-    The clairvoyant baseline is always among them, since all are held against it. Baselines take
-    their sizes from the first bundle, or from that at `sizes_from` if no policy flies. The
-    `figures` are drawn of the results. `px4_build` is where real PX4s are taken from.
+    The clairvoyant baseline always flies, for comparison. Baselines take their sizes from the first
+    bundle, or without policies from the bundle at `sizes_from`. `figures` are drawn from the
+    results. `px4_build` is the build folder of real PX4s.
 
-    Raises BundleError; ValueError that names what is impossible, also what an engine cannot do.
+    Raises BundleError; ValueError that names the impossible value, also what an engine cannot do.
     """
 
     methods: tuple[Method, ...]
@@ -269,7 +267,7 @@ class Study(Bounded):
             )
         names = [method.name for method in self.all_methods]
         if len(set(names)) < len(names):
-            raise ValueError(f"methods {', '.join(names)}: each once")
+            raise ValueError(f"methods {', '.join(names)}: must differ")
         tasks = {task_of(loaded_bundle(path)): path for path in self._bundles}
         if len(tasks) > 1:
             different = "; ".join(f"{path}: {task}" for task, path in tasks.items())
@@ -279,7 +277,7 @@ class Study(Bounded):
             try:
                 self._require(condition)
                 if condition.folder in folders:
-                    raise ValueError(f"title = {condition.name!r}: must be another for each")
+                    raise ValueError(f"title = {condition.name!r}: is used twice")
             except ValueError as error:
                 raise ConditionError(condition, str(error)) from None
             folders.add(condition.folder)
@@ -294,12 +292,12 @@ class Study(Bounded):
             )
 
     def _require(self, condition: Condition) -> None:
-        """Raise ValueError for what cannot be flown under a condition, as far as one can know."""
+        """Raise ValueError if a condition cannot be flown, as far as known in advance."""
         engine, scenario = self.engine_of(condition), condition.scenario
         engine.require_able(scenario)
         if scenario.fault:
             raise ValueError(
-                f"fault = {scenario.fault}: no cost is judged under a fault; a drill flies it"
+                f"fault = {scenario.fault}: must not be given in a study; `lpac drill` flies faults"
             )
         if engine.whole_robots and condition.lost.robots:
             raise ValueError(
@@ -316,30 +314,30 @@ class Study(Bounded):
             scenario.perception_of(loaded_bundle(path))
         if engine.whole_robots:
             open_sensor(scenario.sensor, {}, loaded_bundle(self.sized_by).manifest)
-        # There is room for those on pads.
+        # Check that all fit on their pads.
         for method in self.methods_of(condition):
             next(self.flights_of(method, condition, Draw(self.first_world)))
 
     @property
     def all_methods(self) -> tuple[Method, ...]:
-        """With the clairvoyant baseline."""
+        """The methods, with the clairvoyant baseline."""
         if CLAIRVOYANT in [method.name for method in self.methods]:
             return self.methods
         return (*self.methods, Method(name=CLAIRVOYANT))
 
     @property
     def _bundles(self) -> list[str]:
-        """The paths of all."""
+        """Paths of all bundles."""
         return list(dict.fromkeys(each.path for p in self.methods for each in p.trainings))
 
     @property
     def sized_by(self) -> str:
-        """The path of the bundle from which baselines take their sizes."""
+        """Path of the bundle that gives baselines their sizes."""
         return next(iter(self._bundles), self.sizes_from)
 
     @property
     def sizes(self) -> str:
-        """What baselines take from a bundle, in words."""
+        """Description of the baselines' sizes."""
         return sizes_of(loaded_bundle(self.sized_by))
 
     @property
@@ -350,18 +348,18 @@ class Study(Bounded):
 
     @property
     def needs_records(self) -> bool:
-        """Whether its figures are of whole flights; these are not kept, but flown again."""
+        """Whether its figures need records, which are not stored: such flights are flown again."""
         return any(figure in _OF_RECORDS for figure in self.figures)
 
     def engine_of(self, condition: Condition) -> Engine:
-        """What flies the policies. Raises ValueError without PX4's build where that is needed."""
+        """Engine of the policies. Raises ValueError for PX4 without a build folder."""
         is_px4 = condition.engine == "px4"
         if is_px4 and not self.px4_build:
             raise ValueError("engine = 'px4': needs PX4's build folder, --px4")
         return engine_of(condition.engine, Path(self.px4_build) if is_px4 else None)
 
     def methods_of(self, condition: Condition) -> tuple[Method, ...]:
-        """Those that fly under a condition."""
+        """The methods that fly under a condition."""
         return tuple(
             method
             for method in self.all_methods
@@ -369,7 +367,7 @@ class Study(Bounded):
         )
 
     def flights(self) -> list[PlannedFlight]:
-        """All of them, each once; those over one world beside each other."""
+        """All flights, each once; those over one world are adjacent."""
         wanted = (
             flight
             for condition in self.conditions
@@ -382,7 +380,7 @@ class Study(Bounded):
     def flights_of(
         self, method: Method, condition: Condition, draw: Draw
     ) -> Iterator[PlannedFlight]:
-        """One of each training; of a baseline one."""
+        """One flight for each training, or for the baseline."""
         scenario = self._scenario(method, condition, draw)
         trainings = method.trainings or (TrainedBundle(self.sized_by, self.sizes),)
         for path, bundle_id in trainings:
@@ -403,7 +401,7 @@ class Study(Bounded):
         on_pads = condition.from_pads or condition.engine != "point"
         scenario = replace(
             template,
-            # Where whole robots stand, their receivers and the wind follow from it.
+            # The seed also determines whole robots' pads, receivers and wind.
             seed=(first if on_pads else drawn).seed + draw.trial,
             features=template.features or drawn.features,
         )
@@ -440,20 +438,20 @@ class Study(Bounded):
 
 
 _USUAL = Scenario()
-# What a baseline has no use for: it senses and decides at once, and nothing is sent.
+# Keys without effect on a baseline, which senses and decides at once and sends nothing.
 _OF_POLICIES = (
     "loss", "delay_s", "radio", "max_message_age_s", "max_input_age_s", "payload", "clocks",
     "errors", "wind_m_s", "budget", "sensor", "secure", "transport", "failures",
 )  # fmt: skip
-# What points alone have, or has nothing to do with where whole robots would stand.
+# Keys of points only, or without effect on the pads of whole robots.
 _OF_POINTS = (
     "radio", "payload", "lag_s", "position_error_m", "max_speed_m_s", "clocks", "failures",
 )  # fmt: skip
 
 
 def _of_baseline(scenario: Scenario, name: str, lost: int) -> Scenario:
-    """The same flown by a baseline, which never had those that are lost."""
-    # Starts are drawn alike for all: whoever is lost might be anybody.
+    """The same scenario for a baseline, without the `lost` robots."""
+    # Starts are drawn equally for all robots, so dropping the last ones is no bias.
     robots, starts_m, bias = scenario.robots - lost, scenario.starts_m, scenario.position_bias
     [controller] = [baseline for baseline in BASELINES if baseline == name]
     return replace(
@@ -467,12 +465,12 @@ def _of_baseline(scenario: Scenario, name: str, lost: int) -> Scenario:
 
 
 def _on_pads(scenario: Scenario) -> Scenario:
-    """Whole robots in the world of points, for where these would stand."""
+    """The scenario of whole robots that corresponds to one of points, for their pads."""
     return replace(scenario, **{name: getattr(_USUAL, name) for name in _OF_POINTS})
 
 
 def _around(radii_m: F64, rng: np.random.Generator) -> F64:
-    """(N, 2): so far from the origin, each in a direction of its own."""
+    """Offsets (N, 2) of these lengths in random directions."""
     angles_rad = rng.uniform(0.0, 2.0 * np.pi, len(radii_m))
     directions = np.column_stack([np.cos(angles_rad), np.sin(angles_rad)])
     offsets_m: F64 = radii_m[:, None] * directions
@@ -481,7 +479,7 @@ def _around(radii_m: F64, rng: np.random.Generator) -> F64:
 
 @cache
 def _pads(scenario: Scenario, bundle: str) -> tuple[F64, F64]:
-    """(N, 2) each: where whole robots stand, and what their receivers are off by there, m."""
+    """Positions of whole robots, and their receivers' errors there; (N, 2) each, m."""
     layout = Layout(scenario, Path(bundle))
     return layout.pads_m, layout.landing_points_m - layout.pads_m
 

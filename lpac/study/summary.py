@@ -1,4 +1,4 @@
-"""A study's results for people: the tables of its report and of the terminal, and its figures."""
+"""A study's results for people: tables of its report and of the terminal, and figures."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,19 +18,19 @@ from lpac.sim.engines import EngineName
 from lpac.sim.kept import KeptOutcomes, code_digest
 from lpac.study import figures, rates
 from lpac.study.flights import CLAIRVOYANT, PlannedFlight, fly_all, records_of
-from lpac.study.hearing_robot import message_bytes
 from lpac.study.perturbation import absences_in, absences_of, perturbed_by
+from lpac.study.receiving_robot import message_bytes
 from lpac.study.report import Picture, Report, Table
 from lpac.study.results import MethodResult, as_json, worst_worlds
 from lpac.study.run import Flown, Tell
 from lpac.study.sections import Section, perturbation, repeatability, snapshots
 from lpac.study.study import USUAL_FIGURES, Condition, Draw, Figure, Study
 
-# What these are called beside points.
+# Name of whole robots in figures with points.
 WHOLE_ROBOTS = "whole robots"
-# Of each policy, under the first condition.
+# Number of worlds shown per policy, under the first condition.
 _WORST = 10
-# Which pictures there are, and of which flights.
+# Lists the pictures with the keys of their flights.
 _DRAWN = "drawn.jsonl"
 _FLOWN: dict[EngineName, str] = {
     "point": "Points fly what the policies decide: without takeoff, landing, heights and wind.",
@@ -41,62 +41,62 @@ _FLOWN: dict[EngineName, str] = {
     "software.",
 }
 _WHOLE = (
-    "Costs of whole robots are those of their vehicles' true positions. Curves may begin above 1: "
-    "until the mission begins, whole robots drift from their pads, and costs are over the least "
-    "that any method begins with. Baselines fly as points, from the same pads and with the same "
-    "receivers' errors."
+    "Costs of whole robots are at their vehicles' true positions. Their curves may begin above 1: "
+    "whole robots drift from their pads until the mission begins, and costs are relative to the "
+    "least initial cost of any method. Baselines fly as points, from the same pads and with the "
+    "same receiver errors."
 )
 _COLUMNS = (
     "", "mean\nJ / J(0)", "95 %", "p90", "worst", "area", "vs\nclair-\nvoyant", "p90",
     "vs\nbest\nLloyd",
 )  # fmt: skip
-# What the columns are, and by which rule one is called better; said once below all tables.
+# Explains the columns and the rule of comparison, once below all tables.
 LEGEND = (
-    "J / J(0): cost at the end over that at the start: its mean over the worlds and in which "
-    "interval that is, at 95 % confidence; p90: nine worlds of ten end below, worst: the worst\n"
-    "area: the mean of J / J(0) over the flight, so the area under its curve\n"
-    "vs clairvoyant: how many times that of Lloyd's algorithm that knows the world, mean over "
-    "mean, and, world by world, p90\n"
-    "vs best Lloyd: how many times that of the best of ten such runs, in each world\n"
-    f"{VERDICT_RULE}; else they are not told apart"
+    "J / J(0): final cost over initial cost: its mean over the worlds, with the 95 % interval; "
+    "p90: nine worlds of ten end below; worst: the worst world\n"
+    "area: mean of J / J(0) over the flight\n"
+    "vs clairvoyant: ratio to Lloyd's algorithm with knowledge of the world, of means and, world "
+    "by world, p90\n"
+    "vs best Lloyd: ratio to the best of ten such runs, in each world\n"
+    f"{VERDICT_RULE}; otherwise they are not told apart"
 )
 
 
 def flown_as(study: Study) -> str:
-    """How it was flown, in sentences."""
+    """Description of the engines."""
     engines = dict.fromkeys(condition.engine for condition in study.conditions)
-    said = [_FLOWN[engine] for engine in engines]
-    return " ".join([*said, _WHOLE] if set(engines) != {"point"} else said)
+    text = [_FLOWN[engine] for engine in engines]
+    return " ".join([*text, _WHOLE] if set(engines) != {"point"} else text)
 
 
-def tables_of(told: Mapping[str, Any]) -> list[Table]:
-    """Of each condition: how policies cover, and whether they are better than the baselines.
+def tables_of(data: Mapping[str, Any]) -> list[Table]:
+    """Tables of each condition: costs, and comparisons of policies with baselines.
 
-    `told` is a study's JSON, see `lpac.study.results.as_json`.
+    `data` is a study's JSON, see `lpac.study.results.as_json`.
     """
-    return [table for condition in told["conditions"] for table in _tables(told, condition)]
+    return [table for condition in data["conditions"] for table in _tables(data, condition)]
 
 
-def _tables(told: Mapping[str, Any], condition: Mapping[str, Any]) -> Iterator[Table]:
+def _tables(data: Mapping[str, Any], condition: Mapping[str, Any]) -> Iterator[Table]:
     results = condition["results"]
-    named = {method["name"]: method for method in told["methods"]}
+    named = {method["name"]: method for method in data["methods"]}
     policies = [result for result in results if named[result["name"]]["bundles"]]
-    over = f"{counted(told['worlds'], 'world')} of the {told['world_set']} set"
-    if told["world_set"] is None:
+    over = f"{counted(data['worlds'], 'world')} of the {data['world_set']} set"
+    if data["world_set"] is None:
         over = "all missions of such a team"
-    elif told["trials_per_world"] > 1:
-        over = f"{over}, {told['trials_per_world']} trials in each"
-    note = [] if told["world_set"] is None else [_flown(condition)]
+    elif data["trials_per_world"] > 1:
+        over = f"{over}, {data['trials_per_world']} trials in each"
+    note = [] if data["world_set"] is None else [_flown(condition)]
     if condition["scenario"]["radio"] is not None:
         note.append(LinkQuality(**condition["scenario"]["link"]).in_words)
     note += [
         f"{each['name']}: {_share(each['fails'])} of the worlds end above "
-        f"{told['fails_above']:g} x clairvoyant; in {_share(each['rises_again'])} costs rise again"
+        f"{data['fails_above']:g} x clairvoyant; in {_share(each['rises_again'])} costs rise again"
         for each in policies
     ]
     if condition["compared"] is not None:
         [a, b, *_] = results
-        note += _verdict(condition["compared"], a["name"], b["name"], told["worlds"])
+        note += _verdict(condition["compared"], a["name"], b["name"], data["worlds"])
     yield Table(
         _COLUMNS,
         [_row(result) for result in results],
@@ -114,7 +114,7 @@ def _tables(told: Mapping[str, Any], condition: Mapping[str, Any]) -> Iterator[T
 
 
 def _flown(condition: Mapping[str, Any]) -> str:
-    """The sizes and the engine."""
+    """Text of the sizes and the engine."""
     duration_s, engine = condition["scenario"]["duration_s"], condition["engine"]
     return f"{condition['sizes']}, {duration_s:g} s, engine {engine}"
 
@@ -135,28 +135,28 @@ def _row(result: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _share(told: Mapping[str, Any]) -> str:
-    """With how much it may be in truth."""
-    share, bound = 100.0 * told["share"], 100.0 * told["at_most_share"]
+def _share(data: Mapping[str, Any]) -> str:
+    """Text of a share and its bound."""
+    share, bound = 100.0 * data["share"], 100.0 * data["at_most_share"]
     return f"{share:.3g} % (95 %: at most {bound:.3g})"
 
 
 def _against(policy: Mapping[str, Any], baseline: str) -> str:
-    """Whether better, and in how many worlds it ends above the baseline."""
+    """Text of the comparison with a baseline, and the share of worlds above it."""
     above, verdict = policy["above"][baseline], policy["against"][baseline]
     text = {"a": "better", "b": "worse", None: "not told apart"}[verdict["better"]]
     return f"{text}, above it in {100.0 * above['share']:.3g} %"
 
 
 def _verdict(verdict: Mapping[str, Any], a: str, b: str, worlds: int) -> Iterator[str]:
-    """Whether the first of two policies is better, and how surely."""
+    """Text of the comparison of two policies."""
     ratio, below = verdict["ratio"], verdict["a_below_b"]
-    said = f"the data do not show whether {a} or {b} is better"
+    text = f"the data do not show whether {a} or {b} is better"
     if verdict["better"] is not None:
         better, worse = (a, b) if verdict["better"] == "a" else (b, a)
-        said = f"{better} is better than {worse}"
+        text = f"{better} is better than {worse}"
     yield (
-        f"{said}: cost at the end {ratio[0]:.3f} times (95 %: {ratio[1]:.3f} to {ratio[2]:.3f}), "
+        f"{text}: cost at the end {ratio[0]:.3f} times (95 %: {ratio[1]:.3f} to {ratio[2]:.3f}), "
         f"lower in {100.0 * below[0]:.3g} % of the worlds ({100.0 * below[1]:.3g} to "
         f"{100.0 * below[2]:.3g})"
     )
@@ -164,8 +164,7 @@ def _verdict(verdict: Mapping[str, Any], a: str, b: str, worlds: int) -> Iterato
         yield what_would_tell(Interval95(*verdict["difference"]), worlds)
     if not verdict["of_methods"]:
         yield (
-            "that is true of these bundles; it takes three trainings of each to say it of the "
-            "methods"
+            "this holds for these bundles; a claim about the methods needs three trainings of each"
         )
 
 
@@ -179,25 +178,25 @@ def report_of(
     *,
     compared: bool = False,
 ) -> Report:
-    """The report of a study, whose JSON has what is `further` to be told; draws its figures.
+    """Make a study's report and draw its figures; `further` is added to the JSON.
 
-    Raises OSError; ValueError if flights do not show what a figure is of.
+    Raises OSError; ValueError if the flights do not allow a figure.
     """
     sections = _sections_of(study, flown, folder)
-    told = as_json(study, flown.results, compared=compared)
+    data = as_json(study, flown.results, compared=compared)
     for section in sections:
-        told |= section.told
-    # That of the rates has all conditions in it.
-    of_conditions, text = tables_of(told), study.text
+        data |= section.data
+    # The section of the rates contains all conditions.
+    of_conditions, text = tables_of(data), study.text
     if "rates" in study.figures:
-        of_conditions, text = [], f"{text} First condition: {_flown(told['conditions'][0])}."
+        of_conditions, text = [], f"{text} First condition: {_flown(data['conditions'][0])}."
     return Report(
         name=name,
         title=study.title or name,
         text=f"{text} {flown_as(study)}".strip(),
         legend=LEGEND if of_conditions else "",
-        told={**told, **further},
-        rows=next((section.rows for section in sections), rows_of(told)),
+        data={**data, **further},
+        rows=next((section.rows for section in sections), rows_of(data)),
         tables=[*(table for its in sections for table in its.tables), *of_conditions],
         figures=[picture for its in sections for picture in its.figures]
         + draw_conditions(flown.results, folder, study.figures),
@@ -208,7 +207,7 @@ def report_of(
 
 
 def _worst_in_words(study: Study) -> str:
-    """Nothing if no policy flies under the first condition."""
+    """Text about the pictures; "" if no policy flies under the first condition."""
     condition = study.conditions[0]
     policies = [method.name for method in study.methods_of(condition) if method.trained]
     if not policies:
@@ -221,7 +220,7 @@ def _worst_in_words(study: Study) -> str:
 
 
 def _sections_of(study: Study, flown: Flown, folder: Path) -> list[Section]:
-    """What the study's figures of whole flights and of rates show. Raises OSError, ValueError."""
+    """Sections of whole flights and of rates. Raises OSError, ValueError."""
     condition = study.conditions[0]
     policy = study.methods_of(condition)[0]
     first = {
@@ -243,14 +242,14 @@ def _sections_of(study: Study, flown: Flown, folder: Path) -> list[Section]:
         )
         sections.append(perturbation(perturbed_by(record, absences, range_m), folder))
     if "rates" in study.figures:
-        said = message_bytes(load_bundle(study.sized_by), 2)
+        message_size = message_bytes(load_bundle(study.sized_by), 2)
         results = rates.results_of(flown.results, [_name(study, draw) for draw in study.draws])
-        sections.append(rates.rates(results, said, folder))
+        sections.append(rates.rates(results, message_size, folder))
     return sections
 
 
 def _name(study: Study, draw: Draw) -> str:
-    """Of one flight among those of a policy under a condition."""
+    """Name of a draw among a policy's flights under one condition."""
     world, trial = f"world {draw.world}", f"trial {draw.trial + 1}"
     if study.trials == 1:
         return world
@@ -260,7 +259,7 @@ def _name(study: Study, draw: Draw) -> str:
 def _by_world(
     study: Study, records: Mapping[PlannedFlight, FlightRecord]
 ) -> dict[str, dict[str, FlightRecord]]:
-    """All flights by world, and who flew; of several trainings the first."""
+    """Flights by world and method; the first one of several trainings."""
     found: dict[str, dict[str, FlightRecord]] = {}
     for draw in study.draws:
         for condition in study.conditions:
@@ -272,16 +271,16 @@ def _by_world(
     return found
 
 
-def rows_of(told: Mapping[str, Any]) -> list[list[object]]:
-    """The CSV's: a heading, and a row for each condition, policy, training and world."""
+def rows_of(data: Mapping[str, Any]) -> list[list[object]]:
+    """CSV rows: a heading, then one per condition, policy, training and world."""
     rows: list[list[object]] = [
         ["condition", "method", "training", "world", "cost_over_first", "over_clairvoyant"]
     ]
-    for condition in told["conditions"]:
+    for condition in data["conditions"]:
         for result in condition["results"]:
             costs, over = (result["by_world"][key] for key in ("final", "over_clairvoyant"))
             rows += [
-                [condition["name"], result["name"], training, told["first_world"] + world, *both]
+                [condition["name"], result["name"], training, data["first_world"] + world, *both]
                 for training, of_training in enumerate(zip(costs, over, strict=True))
                 for world, both in enumerate(zip(*of_training, strict=True))
             ]
@@ -293,7 +292,7 @@ def draw_conditions(
     folder: Path,
     chosen: Sequence[Figure] = USUAL_FIGURES,
 ) -> list[Picture]:
-    """The figures of all conditions among those that are chosen. Raises OSError."""
+    """Draw the chosen figures of all conditions. Raises OSError."""
     shown = []
     if "conditions" in chosen and len(results) > 1:
         style.save(figures.over_conditions(results), folder / "conditions")
@@ -321,9 +320,9 @@ def draw_worst(
     pool: Pool,
     tell: Tell = lambda *_: None,
 ) -> None:
-    """The worst worlds of each policy under the first condition, flown again. Raises OSError.
+    """Fly the worst worlds of each policy under the first condition again, and draw them.
 
-    Pictures that are there of the same flights stay.
+    Existing pictures of the same flights stay. Raises OSError.
     """
     condition, of_all = next(iter(results.items()))
     clairvoyant = next(r.method for r in of_all if r.method.name == CLAIRVOYANT)

@@ -1,11 +1,11 @@
-"""The worlds that policies are trained, chosen and judged on.
+"""Sets of worlds for training, selection and evaluation of policies.
 
-World number i of a set has its features, the robots' starts and the draws of their clocks from
-seeds of its own: spawn keys (set, i, what) of one entropy. So no two sets have a world in common,
-and how many worlds are taken of a set changes none of them.
+World number i of a set draws its features, the robots' starts and clocks from its own seeds: spawn
+keys (set, i, purpose) of one entropy. So sets have no common worlds, and a world does not depend on
+how many are used.
 
-Train on "training", choose by "validation". "test" tells how good what was chosen is: whoever looks
-at it, and then chooses, has no test set any more.
+Train on "training" and select on "validation". "test" measures the selected policy; after a
+selection by its results it is no longer a test set.
 """
 
 import math
@@ -23,17 +23,17 @@ WorldSet = Literal["training", "validation", "test"]
 WORLD_SETS: tuple[WorldSet, ...] = get_args(WorldSet)
 
 _ENTROPY = 0x6C706163
-# Never changed, nor used twice: these are the worlds.
+# Never change or reuse these: they define the worlds.
 _SET_KEYS: dict[WorldSet, int] = {"training": 0, "validation": 1, "test": 2}
 _FEATURES, _STARTS, _FLIGHT = range(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetUp(Bounded):
-    """Sizes of a task, in model units; the sensor's and the local map's are the policy's.
+    """Sizes of a task, in model units; those of sensor and local map are the policy's.
 
-    `sigma` are the least and the greatest standard deviation of features.
-    Raises ValueError that names what is impossible.
+    `sigma` is the range of the features' standard deviation. Raises ValueError that names the
+    impossible value.
     """
 
     robots: Annotated[int, Meta(ge=1, le=MAX_ROBOTS)]
@@ -59,12 +59,12 @@ class SetUp(Bounded):
         }
 
     def scenario(self, **changes: Any) -> Scenario:
-        """A flight in this set-up, which is otherwise than usual in what `changes` say."""
+        """A scenario of this set-up with `changes`."""
         return Scenario(**{**self.sizes, **changes})
 
     @classmethod
     def of(cls, scenario: Scenario) -> "SetUp":
-        """That of a scenario whose sizes are known. Raises ValueError that names what is not."""
+        """Set-up of a scenario. Raises ValueError if its sizes are unknown."""
         if scenario.world_size is None or scenario.communication_range is None:
             raise ValueError("world_size, communication_range: must be given")
         return cls(
@@ -80,12 +80,12 @@ FIELD = SetUp(robots=10, world_size=512, communication_range=256.0, features=10)
 
 
 def at_equal_density(robots: int) -> SetUp:
-    """The field's for another number of robots: world area and features grow with them."""
+    """The field's density for another number of robots: area and features grow with it."""
     world_size = round(FIELD.world_size * math.sqrt(robots / FIELD.robots))
     return replace(FIELD, robots=robots, world_size=world_size, features=robots)
 
 
-# By name: the field; other numbers of robots; the paper's training; and the field's otherwise.
+# The field; other numbers of robots; the paper's training; variants of the field.
 SET_UPS: dict[str, SetUp] = {
     "field": FIELD,
     **{f"n{robots}": at_equal_density(robots) for robots in (1, 3, 5, 20, 32, 100, 300, 1000)},
@@ -98,9 +98,9 @@ SET_UPS: dict[str, SetUp] = {
 
 
 class DrawnWorld(NamedTuple):
-    """A world and a flight over it, in model units: `starts` are (x, y) of each robot.
+    """A world and its flight, in model units: `starts` are (x, y) of each robot.
 
-    From `seed` follow what else is random: clocks, losses.
+    `seed` determines all other draws: clocks, losses.
     """
 
     features: tuple[GaussianFeature, ...]
@@ -109,7 +109,7 @@ class DrawnWorld(NamedTuple):
 
 
 def draw_world(world_set: WorldSet, index: int, set_up: SetUp) -> DrawnWorld:
-    """World number `index`, from 0 on, of that set. Raises ValueError if there is none."""
+    """World number `index` >= 0 of a set. Raises ValueError if there is none."""
     if world_set not in _SET_KEYS:
         raise ValueError(f"world_set = {world_set!r}: must be one of {', '.join(_SET_KEYS)}")
     if index < 0:

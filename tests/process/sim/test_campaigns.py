@@ -164,7 +164,7 @@ def test_a_file_of_faults_is_flown_as_a_study(
 
 def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
     for arguments, text in (
-        (("--fault", "nothing"), "--fault nothing: there is none; `lpac drill --list` has all"),
+        (("--fault", "nothing"), "--fault nothing: no such fault; `lpac drill --list` shows all"),
         (("--seeds", 0), "--seeds = 0: must be at least 1"),
         (("--seed", -1), "--seed = -1: must be at least 0"),
         (("--seeds", 2, "--seed", 1), "--seeds and --seed: give one of them"),

@@ -33,7 +33,7 @@ def test_six_faults_are_flown_by_processes(tmp_path: Path) -> None:
 
 def test_what_cannot_be_flown_is_one_line(tmp_path: Path) -> None:
     for arguments, text in (
-        (("--vehicle", "mavlink", "--fault", "radio-dies"), "radio-dies: is not flown with"),
+        (("--vehicle", "mavlink", "--fault", "radio-dies"), "radio-dies: mavlink cannot do it"),
         (("--vehicle", "px4"), "--vehicle px4 needs --px4 with PX4's build folder"),
         (("--vehicle", "px4", "--px4", tmp_path), "has no program bin/px4"),
         (("--px4", tmp_path), "--px4 does nothing with --vehicle simulated"),

@@ -55,5 +55,5 @@ WHY = "may rise at first: robots leave covered areas to explore others"
     ("x_m", "rises"), [((0.0, 0.5, 0.2, 1.9), True), ((0.0, 0.5, 1.0, 1.9), False)]
 )
 def test_a_cost_that_rises_is_explained_beside_it(x_m: tuple[float, ...], rises: bool) -> None:
-    assert (f"It {WHY}" in texts_of(snapshots_and_costs({"LPAC": flight(*x_m)}))) is rises
+    assert (f"The cost {WHY}" in texts_of(snapshots_and_costs({"LPAC": flight(*x_m)}))) is rises
     assert (f"The cost {WHY}" in texts_of(overview(flight(*x_m)))) is rises

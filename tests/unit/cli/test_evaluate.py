@@ -27,7 +27,7 @@ from tests.conftest import SHIPPED
         ({"transports": ["mesh"], "wifi": Path("w.yaml")}, "w.yaml: must be a .toml file"),
         ({"worlds": 0}, "--worlds = 0: must be at least 1"),
         ({"methods": ["frontier-cvt"], "compare": True}, "--compare needs two methods; 1 given"),
-        ({"methods": [str(SHIPPED)] * 2}, "each once"),
+        ({"methods": [str(SHIPPED)] * 2}, "must differ"),
     ],
 )
 def test_options_that_cannot_be(options: dict[str, Any], text: str, tmp_path: Path) -> None:

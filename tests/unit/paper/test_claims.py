@@ -250,7 +250,7 @@ def test_what_was_made_is_not_made_again(
         for task in tasks:
             make(task.name, task.folder)
         empty = Report(
-            name="", title="", text="", told={}, rows=(), tables=(), figures=(), flown="",
+            name="", title="", text="", data={}, rows=(), tables=(), figures=(), flown="",
             made_by={},
         )  # fmt: skip
         return [empty] * len(tasks)

@@ -1,4 +1,4 @@
-"""Drills: which flights they are, what is kept of them, and what is told."""
+"""Drills: their flights, stored outcomes, and reports."""
 
 import itertools
 from collections.abc import Generator, Sequence
@@ -24,7 +24,7 @@ HELD = Figure("lands", 2.4, 3.3, "s")
 
 
 def outcome_of(flight: PlannedFlight) -> FlightOutcome:
-    """Of a flight whose seed says what becomes of it."""
+    """Outcome determined by the flight's seed."""
     return {
         0: FlightOutcome((HELD,)),
         1: FlightOutcome((BROKEN,)),
@@ -40,7 +40,7 @@ def test_without_names_all_faults_of_the_engine_are_flown() -> None:
 
 
 def test_flights_that_share_their_begin_are_beside_each_other() -> None:
-    """So that each process makes it once for all of them."""
+    """So that a process computes the common start once."""
     flights = Drill(seeds=2).flights()
     begins = [(flight.scenario, FAULTS[flight.scenario.fault].settings) for flight in flights]
     changes = sum(a != b for a, b in itertools.pairwise(begins))
@@ -65,7 +65,7 @@ def test_what_was_judged_is_kept_and_the_rest_flown_again(tmp_path: Path) -> Non
 
 def test_another_bundle_is_not_taken_for_it() -> None:
     [flight] = Drill(faults=("held",)).flights()
-    with pytest.raises(ValueError, match="is another bundle by now"):
+    with pytest.raises(ValueError, match="differs from the planned bundle"):
         outcomes_of((replace(flight, flown_by="0" * 64),))
 
 
@@ -110,9 +110,9 @@ def test_a_drill_is_a_file(tmp_path: Path) -> None:
     file.write_text(f'faults = []\nseeds = 3\nbundle = "{SHIPPED}"\n')
     assert len(read_drill(file).flights()) == 3 * len(FAULTS)
     for text, said in (
-        ("faults = ['nothing']", "mine.toml: faults: nothing: there is none"),
+        ("faults = ['nothing']", "mine.toml: faults: nothing: no such fault"),
         ("faults = []\nrobots = 11", "mine.toml: robots = 11: must be from 2 to 10"),
-        ("faults = ['radio-dies']\nengine = 'mavlink'", "radio-dies: is not flown with mavlink"),
+        ("faults = ['radio-dies']\nengine = 'mavlink'", "radio-dies: mavlink cannot do it"),
         ("faults = []\ntitle = 3", "unknown key 'title': a file with `faults` is a drill, whose"),
     ):
         file.write_text(text)

@@ -1,4 +1,4 @@
-"""Studies as TOML files: what they mean, and mistakes in one line."""
+"""Studies in TOML files, and one-line errors."""
 
 from pathlib import Path
 
@@ -67,7 +67,7 @@ def test_what_it_means(tmp_path: Path) -> None:
     )  # fmt: skip
     for condition in study.conditions:
         assert condition.scenario.world_size == 640 and condition.scenario.duration_s == 20.0
-        # All else is the field's.
+        # All else equals the field's.
         assert condition.scenario.random_feature_count == FIELD.features
     assert (study.title, study.worlds, study.figures) == ("Loss in wind", 3, ("curves",))
 
@@ -107,11 +107,11 @@ def test_a_world_of_ones_own_and_paths_count_from_the_files_folder(tmp_path: Pat
         ("wind_m_s = 5.0", 'lost = "2"', "conditions[1]: lost = '2': must be ROBOTS@SECONDS"),
         ("wind_m_s = 5.0", "robots = 31", "conditions[1]: robots = 31: must be from 1 to 30"),
         ("[[conditions]]", "[[conditions", "wind.toml: "),
-        ("[0.0, 0.3]", "[]", "conditions[0]: loss = []: must have a value"),
+        ("[0.0, 0.3]", "[]", "conditions[0]: loss = []: must have at least one"),
         ("[0.0, 0.3]", "[[0.0, 0.3]]", "conditions[0]: loss = [0.0, 0.3]: "),
         ("[0.0, 0.3]", "0.3\nmethods = []", "conditions[0]: methods = []: must be at least 1 long"),
         ("[0.0, 0.3]", '0.3\nmethods = ["g"]', "conditions[0]: methods = 'g': must be one of "),
-        ("field = []", "clairvoyant-cvt = []", "policies: name = 'clairvoyant-cvt': must be an"),
+        ("field = []", "clairvoyant-cvt = []", "policies: name = 'clairvoyant-cvt': is a base"),
         ("field = []", '"" = []', "policies: name = '': must be 1 to 200 letters on one line"),
         ("field = []", '"a\\nb|c" = []', "policies: name = 'a\\nb|c': must be "),
         ("field = []", f"{'a' * 300} = []", "policies: name = 'aaa"),
@@ -119,7 +119,7 @@ def test_a_world_of_ones_own_and_paths_count_from_the_files_folder(tmp_path: Pat
         ("wind_m_s = 5.0", 'title = "../mine"', "conditions[1]: title = '../mine': must be "),
         ("wind_m_s = 5.0", 'lost = "2@9"', "conditions[1]: lost = 2@9: must not be given for whol"),
         ("wind_m_s = 5.0", "from_pads = true", "conditions[1]: from_pads = True: must be False "),
-        ("wind_m_s = 5.0", 'fault = "landed"', "conditions[1]: fault = landed: no cost is judged"),
+        ("wind_m_s = 5.0", 'fault = "landed"', "conditions[1]: fault = landed: must not be given"),
         ("wind_m_s = 5.0", 'sensor = "eyes"', "conditions[1]: sensor"),
         ("wind_m_s = 5.0", "robots = 2\nworld_size = 64", "conditions[1]: robots = 2: 1 fit on 4"),
         ("wind_m_s = 5.0", 'world = "nix.env"', "conditions[1]: world = 'nix.env': "),

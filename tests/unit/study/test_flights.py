@@ -1,4 +1,4 @@
-"""Flights of a study: those of its worlds, flown together, and kept."""
+"""Flights of a study: their worlds, groups, and stored outcomes."""
 
 import json
 from collections.abc import Generator, Sequence
@@ -132,7 +132,7 @@ def test_the_best_of_ten_runs_of_lloyds_is_no_more_than_the_clairvoyant() -> Non
 
 
 def test_another_bundle_is_not_taken_for_it() -> None:
-    with pytest.raises(ValueError, match="is another bundle by now"):
+    with pytest.raises(ValueError, match="differs from the planned bundle"):
         curves_of((replace(flight_of(), flown_by="0" * 64),))
 
 
@@ -175,7 +175,7 @@ def test_what_was_flown_is_kept(tmp_path: Path) -> None:
         yield
 
     assert dict(KeptFlights(tmp_path, CostCurve).fly(curves_of, [flight], refuse)) == first
-    # What another version of the code has flown does not count.
+    # Outcomes of another version of the code are ignored.
     path = tmp_path / "flights.jsonl"
     came_of, *lines = path.read_text().splitlines()
     other = json.dumps({**json.loads(came_of), "code": "x"})
@@ -186,7 +186,7 @@ def test_what_was_flown_is_kept(tmp_path: Path) -> None:
 
 
 def test_in_real_time_flights_go_one_after_another_in_this_process() -> None:
-    """Whatever the pool; nothing is late there but by its own radio."""
+    """With any pool; in real time messages are late only by the radio."""
     condition = Condition(engine="mavlink")
     study = Study(methods=(OURS,), conditions=(condition,), worlds=2)
     flights = [f for f in study.flights() if f.scenario.controller == "lpac"]

@@ -1,4 +1,4 @@
-"""Rates and late messages: what results are held against, and what is told of them."""
+"""Rates and late messages: references, and reports."""
 
 import csv
 import json
@@ -41,7 +41,7 @@ STUDY = Study(
 
 
 def flown() -> list[TimingResult]:
-    """Costs that fall to what the timing and the world make of them."""
+    """Costs that fall to a value determined by timing and world."""
     curves = {}
     for condition in STUDY.conditions:
         for draw in STUDY.draws:
@@ -57,7 +57,7 @@ def flown() -> list[TimingResult]:
 
 
 def reported(results: list[TimingResult], folder: Path, *, paired: bool = True) -> str:
-    """README.md."""
+    """Text of README.md."""
     section = rates(results, 2000, folder, paired=paired)
     made_by = {"command": "lpac paper async --quick"}
     section.report("async", "Rates", "Flown.", made_by).write(folder)
@@ -95,7 +95,7 @@ def test_the_report_has_every_flight_and_says_what_made_it(tmp_path: Path) -> No
     assert told["made_by"] == {"command": "lpac paper async --quick"}
     assert told["times_s"] == [15.0, 30.0, 60.0] and len(told["timings"]) == 4
     assert text.count("\n| ") == 2 + 4 and "`lpac paper async --quick`" in text
-    assert "dashed" in text and "in pairs" in text
+    assert "dashed" in text and "paired by world" in text
     for name in ("rates", "staleness"):
         assert f"({name}.png)" in text
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
@@ -110,7 +110,7 @@ def test_without_late_messages_nothing_is_told_of_them(tmp_path: Path) -> None:
 
 
 def mission(rates: LoopRates | None, end: float, duration_s: float = 60.0) -> FlightRecord:
-    """Its cost falls from 1 to `end` in half a minute."""
+    """A mission with a cost that falls from 1 to `end` in half a minute."""
     times_s = np.linspace(0.0, duration_s, 61)
     falling = np.interp(times_s, (0.0, 30.0), (1.0, end))
     its = SimpleNamespace(rates=rates, curve_time_s=times_s, normalized=falling)
@@ -135,13 +135,13 @@ def test_missions_of_logs_are_held_against_those_at_the_fields_rates(tmp_path: P
     np.testing.assert_allclose(slowly.costs, [[0.8, 0.6, 0.6]])
     np.testing.assert_allclose(slowly.area, [0.7])
     value, low, high = slowly.over_field[-1]
-    # There is one of these, and those with the field's rates come to 0.2 to 0.4.
+    # A single one; those with the field's rates end at 0.2 to 0.4.
     assert (value, low, high) == pytest.approx((2.0, 1.5, 3.0))
     text = reported(results, tmp_path, paired=False)
-    assert "in pairs" not in text and "drawn by themselves" in text
+    assert "paired by world" not in text and "unpaired missions" in text
     rows = csv.DictReader((tmp_path / "async.csv").read_text().splitlines())
     assert [row["world"] for row in rows] == ["field-1", "field-2", "slow-1"]
-    with pytest.raises(ValueError, match="no mission of 60 s was flown with perception at 5 Hz"):
+    with pytest.raises(ValueError, match="no mission of 60 s has perception at 5 Hz"):
         results_of_logs({"slow-1": missions["slow-1"], "short": missions["short"]})
 
 

@@ -1,4 +1,4 @@
-"""The numbers that a study tells of its flights."""
+"""Numbers that follow from a study's flights."""
 
 import json
 from dataclasses import asdict, replace
@@ -33,9 +33,9 @@ STUDY = Study(
     conditions=(PLAIN, LOSSY, EIGHT),
     worlds=WORLDS,
 )
-# What each ends at, of 100 at the start; in world 3 the first policy is bad, and rises again.
+# Final costs, initially 100; in world 3 the first policy is bad, and rises again.
 ENDS = {"ida": 30.0, "idb": 31.0, "idc": 32.0, "idd": 33.0}
-# Seeds tell the worlds.
+# Seeds identify the worlds.
 WORLD_OF = {
     flight.scenario.seed: draw.world
     for draw in STUDY.draws
@@ -44,7 +44,7 @@ WORLD_OF = {
 
 
 def flown(flight: PlannedFlight) -> CostCurve:
-    """Worlds differ by 10 % each; robots that are missing from the start cost 20 % more."""
+    """Worlds differ by 10 % each; robots missing from the start cost 20 % more."""
     scenario, world = flight.scenario, WORLD_OF[flight.scenario.seed]
     scale = 1.0 + 0.1 * world
     if scenario.robots < FIELD.robots:
@@ -91,7 +91,7 @@ def test_with_losses_baselines_are_the_same_and_policies_are_not() -> None:
 
 def test_lost_robots_are_held_against_those_who_never_had_them() -> None:
     one, _, rival, clairvoyant = RESULTS[EIGHT]
-    # All over what all ten began with.
+    # All relative to the initial cost of ten robots.
     np.testing.assert_allclose(rival.curves[..., 0], 1.2)
     np.testing.assert_allclose(clairvoyant.final, 0.25 * 1.2)
     assert one.over_clairvoyant[0, 0] == pytest.approx(0.3 / 0.3)
@@ -111,7 +111,7 @@ def test_what_is_told_is_what_was_flown() -> None:
     assert three["above"]["clairvoyant-cvt"]["share"] == 1.0
     assert one["final"]["interquartile_mean"][0] == pytest.approx(0.3)
     assert three["against"]["decentralized-cvt"]["better"] == "a"
-    # On average the first is worse, but for one world: the data do not tell.
+    # The first has a worse mean, but only because of one world: no verdict.
     assert field["compared"]["better"] is None
     assert field["compared"]["a_below_b"][0] == pytest.approx(7 / 8)
     assert not field["compared"]["of_methods"]
@@ -132,8 +132,8 @@ def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:
     [
         ({"worlds": 0}, "worlds = 0: must be from 1 to 10000"),
         ({"world_set": "tests"}, "world_set = 'tests': allowed are 'training', 'validation'"),
-        ({"methods": (ONE, ONE)}, "methods one, one, clairvoyant-cvt: each once"),
-        ({"conditions": (PLAIN, replace(PLAIN, title="field"))}, "title = 'field': must be ano"),
+        ({"methods": (ONE, ONE)}, "methods one, one, clairvoyant-cvt: must differ"),
+        ({"conditions": (PLAIN, replace(PLAIN, title="field"))}, "title = 'field': is used twi"),
         ({"conditions": ()}, "conditions = .*: must be at least 1 long"),
         (
             {"conditions": (Condition(scenario=SET_UPS["n32"].scenario(), engine="simulated"),)},
@@ -149,7 +149,7 @@ def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:
                     Condition(scenario=FIELD.scenario(fault="landed"), engine="simulated"),
                 )
             },
-            "fault = landed: no cost is judged under a fault",
+            "fault = landed: must not be given in a study",
         ),
         ({"conditions": (Condition(engine="px4"),)}, "engine = 'px4': needs PX4's build folder"),
         ({"conditions": (Condition(methods=("two",)),)}, "methods = 'two': must be one of one, "),

@@ -48,7 +48,7 @@ def test_a_folder_keeps_what_was_flown(tmp_path: Path) -> None:
         for one, other in zip(results, again, strict=True):
             np.testing.assert_array_equal(one.curves, other.curves)
     lines = (tmp_path / "flights.jsonl").read_text().splitlines()
-    assert len(lines) == 1 + flights  # the first says of which code
+    assert len(lines) == 1 + flights  # the first line has the code's digest
 
 
 def test_what_studies_share_is_flown_once_and_those_that_need_records_have_them(
@@ -75,7 +75,7 @@ def test_what_studies_share_is_flown_once_and_those_that_need_records_have_them(
         for one, other in zip(of_each[name].results[CONDITION], run(study)[CONDITION], strict=True):
             np.testing.assert_array_equal(one.curves, other.curves)
     assert not of_each["all"].records and {*of_each["part"].records} == {*part.flights()}
-    # Costs are kept, and records are not.
+    # Costs are stored, records are not.
     groups.clear()
     assert of_each.keys() == dict(run_together(studies, pool, tmp_path, lambda *_: None)).keys()
     assert flown() == {*part.flights()}
@@ -85,7 +85,7 @@ def test_what_studies_share_is_flown_once_and_those_that_need_records_have_them(
 def test_each_trial_in_each_world_is_told(tmp_path: Path) -> None:
     study = replace(STUDY, trials=2, figures=("snapshots",))
     [(name, flown)] = run_together({"it": study}, in_this_process, tmp_path, lambda *_: None)
-    told = report_of(name, study, flown, tmp_path, {}, {}).told
+    told = report_of(name, study, flown, tmp_path, {}, {}).data
     assert [*told["flights"]] == [f"world {w}, trial {t}" for w in (0, 1) for t in (1, 2)]
 
 
@@ -116,7 +116,7 @@ def test_a_report_says_what_flew_and_pictures_of_the_same_flights_stay(
         summary.draw_worst(
             study, flown.results, tmp_path, in_this_process, lambda *done: told.append(done)
         )
-    # Each is flown, and drawn, once.
+    # Each is flown and drawn once.
     assert drawn == [["ours", "clairvoyant-cvt"]] * 2 and len(told) == 4 + 2
     assert told[-1] == (6, 6) and len([*tmp_path.glob("worst/ours/*.png")]) == 2
 
@@ -124,7 +124,7 @@ def test_a_report_says_what_flew_and_pictures_of_the_same_flights_stay(
 def test_a_method_needs_its_bundles() -> None:
     with pytest.raises(ValueError, match="baseline 'none': must be one of decentralized-cvt, "):
         Method.of("none")
-    with pytest.raises(ValueError, match="name = 'clairvoyant-cvt': must be another, since a base"):
+    with pytest.raises(ValueError, match="name = 'clairvoyant-cvt': is a baseline's"):
         Method.of("clairvoyant-cvt", SHIPPED)
     with pytest.raises(BundleError, match="nowhere"):
         Method.of("gone", Path("nowhere"))

@@ -1,4 +1,4 @@
-"""What reports tell of whole flights: worlds, trials, and robots that are taken away."""
+"""Sections about whole flights: worlds, trials, and robots that are taken away."""
 
 import csv
 from dataclasses import replace
@@ -27,7 +27,7 @@ MADE_BY = {"command": "lpac paper ..."}
 def flown(
     name: str, duration_s: float, engine: EngineName = "point", **changes: object
 ) -> list[FlightRecord]:
-    """An experiment's flights of its policy, shorter."""
+    """Flights of an experiment's policy, shortened."""
     study = experiment(name, [DEFAULT_BUNDLE], engine=engine)
     scenarios = []
     for draw in study.draws:
@@ -37,7 +37,7 @@ def flown(
 
 
 def written(name: str, section: Section, folder: Path) -> str:
-    """Its README.md."""
+    """Text of README.md."""
     section.report(name, name, "Flown.", MADE_BY).write(folder)
     return (folder / "README.md").read_text()
 
@@ -49,7 +49,7 @@ def test_who_is_away_does_not_count(tmp_path: Path) -> None:
     away = (told.time_s >= 2.0) & (told.time_s < 4.0)
     np.testing.assert_array_equal(np.isnan(told.speed_m_s[:, 2]), away)
     assert not np.isnan(np.delete(told.speed_m_s, 2, axis=1)).any()
-    # Who was in its range has one neighbour less.
+    # Robots in its range have one neighbour less.
     before, after = (int(np.searchsorted(told.time_s, at_s)) for at_s in (1.8, 2.2))
     lost = np.delete(told.neighbours[before] - told.neighbours[after], 2)
     assert lost.max() >= 1.0
@@ -66,10 +66,10 @@ def test_who_is_away_does_not_count(tmp_path: Path) -> None:
     assert "| robot 2 away | 2 to 4 s |" in text and "`lpac paper ...`" in text
     rows = list(csv.DictReader((tmp_path / "e3.csv").read_text().splitlines()))
     assert len(rows) == 10 * len(told.time_s)
-    assert len(section.told["phases"]) == 2
+    assert len(section.data["phases"]) == 2
     assert (tmp_path / "perturbation.png").stat().st_size > 20_000
     costs = list(csv.DictReader((tmp_path / "cost.csv").read_text().splitlines()))
-    assert float(costs[-1]["cost_over_first"]) == section.told["flight"]["final"]
+    assert float(costs[-1]["cost_over_first"]) == section.data["flight"]["final"]
 
 
 def test_in_a_log_robots_are_taken_while_a_pilot_has_them() -> None:
@@ -112,11 +112,11 @@ def test_trials_and_worlds_are_reported(tmp_path: Path) -> None:
     apart_m = np.linalg.norm(ends_m[0] - ends_m[1], axis=1).mean()
     assert spread["mean_scatter_of_ends_m"] == pytest.approx(apart_m / 2.0)
     section = repeatability(records, tmp_path / "e2", 40.0)
-    told = section.told["trials"]["trial 2"]
+    told = section.data["trials"]["trial 2"]
     assert told["final"] == pytest.approx(finals[1])
-    # Points are where they are, whatever their receivers say.
+    # Points are at their true positions, whatever their receivers measure.
     assert told["final_true"] == told["final"]
-    assert set(section.told["mission_from_s"].values()) == {0.0}
+    assert set(section.data["mission_from_s"].values()) == {0.0}
     assert (tmp_path / "e2" / "repeatability.pdf").exists()
 
     worlds = {
@@ -135,7 +135,7 @@ def test_trials_of_different_teams_are_compared_by_name() -> None:
     spread = spread_of(trials)
     assert spread["missing"] == {"trial 2": ["0", "1", "2"]}
     assert who_is_missing(spread) == [
-        "At the end of trial 2 not in the air, and so not compared: 0, 1, 2."
+        "Not compared, because not in the air at the end of trial 2: 0, 1, 2."
     ]
     ends_m = [np.array([r.position_m[-1, :2] for r in record.robots]) for record in (first, second)]
     apart_m = np.linalg.norm(ends_m[0] - ends_m[1], axis=1)[3:].mean()
@@ -157,15 +157,15 @@ def test_of_whole_robots_it_is_told_where_they_truly_were(tmp_path: Path) -> Non
     flown_whole = engine_of("simulated").fly(few, DEFAULT_BUNDLE)
     records = {str(number): record for number, record in enumerate(flown_whole)}
     section = repeatability(records, tmp_path, 40.0)
-    for name, trial in section.told["trials"].items():
+    for name, trial in section.data["trials"].items():
         assert trial["final_true"] != trial["final"]
         assert set(trial["final_positions_m"]) == {"r0", "r1"}
-        # From the takeoff command on, before which nobody moves.
-        began_s = section.told["mission_from_s"][name]
+        # From the takeoff command on, before which no robot moves.
+        began_s = section.data["mission_from_s"][name]
         assert 2.0 < began_s < 40.0
         assert trial["time_s"][0] == 0.0
         assert trial["time_s"][-1] == pytest.approx(began_s + records[name].duration_s)
         assert trial["normalized_true_cost"][:2] == pytest.approx([1.0, 1.0], abs=1e-3)
     written("e2", section, tmp_path)
     rows = list(csv.DictReader((tmp_path / "e2.csv").read_text().splitlines()))
-    assert float(rows[-1]["true_cost_over_first"]) == section.told["trials"]["1"]["final_true"]
+    assert float(rows[-1]["true_cost_over_first"]) == section.data["trials"]["1"]["final_true"]

@@ -1,4 +1,4 @@
-"""Starts, seeds and errors of a study's flights, as the paper's experiments draw them."""
+"""Starts, seeds and errors of a study's flights, as in the paper's experiments."""
 
 import math
 from itertools import combinations, pairwise
@@ -20,7 +20,7 @@ def studied(name: str, engine: EngineName = "point", *, quick: bool = False) -> 
 
 
 def scenarios_of(study: Study, method: int = 0, condition: int = 0) -> list[Scenario]:
-    """One for each draw."""
+    """One scenario for each draw."""
     return [
         next(
             study.flights_of(study.all_methods[method], study.conditions[condition], draw)
@@ -79,12 +79,12 @@ def test_whole_robots_stand_on_pads_with_room_between_them() -> None:
         assert np.linalg.norm(offsets_m, axis=1).max() <= 2.0 * 0.1
     elsewhere = scenarios_of(studied("e3", "simulated"))
     for scenario in (*worlds, *trials, *elsewhere):
-        # Or the ground refuses the fleet.
+        # Closer pads would be refused by the ground.
         layout = Layout(scenario, DEFAULT_BUNDLE)
         for places_m in (layout.pads_m, layout.landing_points_m):
             apart_m = [math.dist(a, b) for a, b in combinations(places_m.tolist(), 2)]
             assert min(apart_m) >= layout.apart_m
-    # Points beside them begin where they stand.
+    # Points start at the same places.
     [beside, *_] = scenarios_of(studied("e1", "simulated"), condition=1)
     assert beside.starts_m and beside.position_bias
     np.testing.assert_array_equal(beside.starts_m, Layout(worlds[0], DEFAULT_BUNDLE).pads_m)
@@ -104,7 +104,7 @@ def test_rates_are_flown_once_and_nothing_is_forgotten_before_two_periods() -> N
 
 
 def test_whole_robots_fly_what_they_can() -> None:
-    """Never all at the same moments; in real time nothing is late but by its radio."""
+    """Never synchronised; in real time, delays are the radio's only."""
     points, whole = studied("async"), studied("async", "simulated")
     kept = [c.scenario for c in points.conditions if not c.scenario.clocks.synchronous]
     assert [condition.scenario for condition in whole.conditions] == kept

@@ -1,4 +1,4 @@
-"""The worlds of the sets are fixed, and no set has one of another."""
+"""The worlds of the sets are fixed, and sets have no common worlds."""
 
 import itertools
 
@@ -32,7 +32,7 @@ def test_no_two_worlds_of_all_sets_are_alike() -> None:
 
 
 def test_the_worlds_stay_what_they_are() -> None:
-    """With another numpy, too: what is told on different days is told of the same worlds."""
+    """Also with another numpy: results of different days must be over the same worlds."""
     for name, told in FIRST_WORLDS.items():
         world = draw_world(name, 0, FIELD)
         first = (world.seed, *world.features[0].mean, *world.starts[0])

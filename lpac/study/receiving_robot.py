@@ -1,4 +1,4 @@
-"""One robot of a bundle's policy that hears others, without a flight."""
+"""One robot with a policy and received messages, without a flight."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from edge.policy.bundle import Bundle
 from edge.policy.family import Observation, PolicyStep
 
 
-class HearingRobot:
-    """A robot among so many others around it, all of which it hears.
+class ReceivingRobot:
+    """A robot that receives from `others` robots around it.
 
-    Raises BundleError if no robot can fly the bundle.
+    Raises BundleError if robots cannot fly the bundle.
     """
 
     def __init__(self, others: int, bundle: Bundle) -> None:
@@ -29,20 +29,20 @@ class HearingRobot:
             middle + rng.uniform(-reach, reach, (others, 2)),
             np.zeros(2),
         )
-        self._heard = list(rng.random((others, policy.message_size), np.float32))
+        self._payloads = list(rng.random((others, policy.message_size), np.float32))
 
     def step(self) -> PolicyStep:
         """Perceive and decide."""
         features = self._agent.observe(self._observed).features
-        return self._agent.step(features, self._heard, len(self._heard))
+        return self._agent.step(features, self._payloads, len(self._payloads))
 
 
 def message_bytes(bundle: Bundle, others: int) -> int:
-    """The most that a robot says at a time once it has heard so many others, in float16.
+    """Size of the largest message of a robot with `others` neighbours, in float16.
 
-    Raises BundleError if no robot can fly it.
+    Raises BundleError if robots cannot fly the bundle.
     """
     assert bundle.manifest.perception is not None
-    said = HearingRobot(others, bundle).step().payload
-    of_policy = most_bytes(said.size, "float16", bundle.manifest.perception.shared_map_side)
+    payload = ReceivingRobot(others, bundle).step().payload
+    of_policy = most_bytes(payload.size, "float16", bundle.manifest.perception.shared_map_side)
     return BEACON_BYTES + of_policy + OVERHEAD_BYTES
