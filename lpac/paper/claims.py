@@ -1,6 +1,6 @@
-"""What the paper says, and what the experiments here say of it. Pure: numbers from their JSON.
+"""Claims of the paper, and the verdicts of the experiments here. Pure: numbers from their JSON.
 
-A verdict follows from a rule that is written beside the claim, never from a person's impression.
+Each verdict follows from a rule that is written beside its claim.
 """
 
 import math
@@ -21,24 +21,24 @@ from lpac.study.worlds import FIELD, SET_UPS
 
 Json = Mapping[str, Any]
 
-# A cost has settled once it stays within so much of what it comes to in the end.
+# A cost has settled when it stays within this share of its final value.
 _SETTLED = 0.1
-# Costs at the end of trials are similar that deviate by no more than so much of their mean.
+# Final costs of trials are similar if their deviation is at most this share of their mean.
 _SIMILAR = 0.2
-# What a robot that is taken away may cost, and what may remain once it is back.
+# Largest cost, relative to the one before, with a robot away and after its return.
 _AWAY, _BACK = 1.6, 1.1
-# Robots that cover other worlds as well as the field's come to no more of clairvoyant's cost.
+# In other worlds, the largest cost over clairvoyant's that counts as a transfer.
 _TRANSFERS = 1.25
-# A swarm of whom each hears so many says nothing of those that hear few.
+# If more than this share of the others is in range, a swarm hardly differs from a centralised one.
 _NEARLY_ALL = 0.9
-# A step with a hundred heard takes no more than so many times as long as with two.
+# A step with a hundred neighbours takes at most this multiple of one with two.
 _AS_LONG = 2.0
-# What it may cost that each robot has moments of its own.
+# Largest relative cost of unsynchronised robots.
 _ASYNCHRONOUS = 1.05
 
 
 class Agreement(StrEnum):
-    """What ours says of the paper's."""
+    """Result of a comparison with the paper."""
 
     AGREES = "agrees"
     DIFFERS = "differs"
@@ -48,7 +48,7 @@ class Agreement(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """`paper` is what it says, `rule` when ours agrees, `ours` what came out."""
+    """`paper` is the claim, `rule` the condition of agreement, `ours` the result here."""
 
     name: str
     paper: str
@@ -58,23 +58,23 @@ class Claim:
 
 
 class Sizes(NamedTuple):
-    """What a robot says at most once it has heard two others, and a hundred; bytes in float16."""
+    """Sizes of a robot's largest message with two and a hundred neighbours; bytes in float16."""
 
     of_two: int
     of_hundred: int
 
 
 class Effort(NamedTuple):
-    """How long a robot's perception and policy take with two others heard, and a hundred; s."""
+    """Times of a robot's perception and policy with two and a hundred neighbours; s."""
 
     of_two_s: float
     of_hundred_s: float
 
 
 def claims_of(made: Mapping[str, Json], sizes: Sizes, effort: Effort) -> list[Claim]:
-    """All claims of the paper that something was `made` for, in the paper's order.
+    """All claims with results in `made`, in the paper's order.
 
-    `made` has the JSON that each experiment left, by the name of its command.
+    `made` has the JSON of each experiment by the name of its command.
     """
     found = [_decentralised(made["e3"])] if "e3" in made else []
     found += [_size(sizes), _computation(effort)]
@@ -95,9 +95,9 @@ def _size(sizes: Sizes) -> Claim:
     return Claim(
         "Message size",
         "A message's size does not depend on the number of robots.",
-        "A robot that has heard a hundred others sends no more bytes than one that has heard two.",
-        f"{sizes.of_two} bytes at most in float16, with beacon, envelope and shared map, after two "
-        f"others were heard; {sizes.of_hundred} after a hundred.",
+        "A robot with a hundred neighbours sends no more bytes than one with two.",
+        f"{sizes.of_two} bytes at most in float16, with beacon, envelope and shared map, for two "
+        f"neighbours; {sizes.of_hundred} for a hundred.",
         _agrees(sizes.of_hundred <= sizes.of_two),
     )
 
@@ -107,13 +107,13 @@ def _computation(effort: Effort) -> Claim:
     return Claim(
         "Computation",
         "What a robot computes does not depend on the number of robots.",
-        f"A step with a hundred others heard, all in range, takes at most {_AS_LONG:g} times as "
-        "long as one with two: fifty times as many may at most double it.",
-        f"Perception and policy, on one core of the machine that wrote this page, in turns: "
+        f"A step with a hundred neighbours, all in range, takes at most {_AS_LONG:g} times as long "
+        "as one with two: fifty times as many may at most double it.",
+        f"Perception and policy, alternating on one core of the machine that wrote this page: "
         f"{1e3 * effort.of_two_s:.2f} ms with two, {1e3 * effort.of_hundred_s:.2f} ms with a "
         f"hundred, {ratio:.2f} times as long. The networks compute the same in both; only drawing "
-        "the maps and adding up messages grows with the number heard. Authenticating and decoding "
-        "what others say is not included, and grows with all that send.",
+        "maps and adding messages grows with the number of neighbours. Authentication and decoding "
+        "of messages are not included, and grow with the number of senders.",
         _agrees(ratio <= _AS_LONG),
     )
 
@@ -122,13 +122,13 @@ def _decentralised(e3: Json) -> Claim:
     mean, others = e3["neighbours"]["mean"], e3["neighbours"]["others"]
     return Claim(
         "Decentralised",
-        "Each robot decides by what it senses and what its neighbours say.",
+        "Each robot decides by its own sensor and its neighbours' messages.",
         "No other messages reach a robot's policy. It is undecided if on average more than "
-        f"{100.0 * _NEARLY_ALL:.0f} % of the others are in range: that would be hardly different "
-        "from knowing all.",
+        f"{100.0 * _NEARLY_ALL:.0f} % of the others are in range, which hardly differs from "
+        "knowing all.",
         f"In E3's flight a robot had {mean:.1f} of {others} others in range, on average. The "
-        "program gives its policy no other messages; its log holds all that the policy is given, "
-        "and `lpac replay` comes to the same decisions from that alone.",
+        "program gives its policy no other messages; its log holds all inputs of the policy, and "
+        "`lpac replay` reproduces the decisions from these alone.",
         Agreement.OPEN if mean > _NEARLY_ALL * others else Agreement.AGREES,
     )
 
@@ -187,7 +187,7 @@ def _e2(e2: Json) -> list[Claim]:
         Claim(
             "E2: repeatable under GPS errors",
             "Three trials in one world, with robots placed within 10 cm: the curves differ, the "
-            "costs at the end are similar, and GPS scatters where robots start and end.",
+            "costs at the end are similar, and GPS scatters the robots' starts and ends.",
             f"{e2['looked_at_s']:g} s after the takeoff command, as in the paper's figure, or of "
             "the mission where there is no takeoff, the costs' standard deviation is at most a "
             "fifth of their mean.",
@@ -241,10 +241,10 @@ def _transfer(transfer: Json) -> list[Claim]:
     ]
 
 
-def _asynchrony(told: Json) -> list[Claim]:
+def _asynchrony(data: Json) -> list[Claim]:
     by_timing = {
         Timing(*(of[name] for name in Timing._fields)): [Interval95(*r) for r in of["over_field"]]
-        for of in told["timings"]
+        for of in data["timings"]
     }
 
     def ends(timings: Sequence[Timing]) -> str:
@@ -259,8 +259,8 @@ def _asynchrony(told: Json) -> list[Claim]:
     slower = [t for t in own if t.policy_hz < FIELD_TIMING.policy_hz]
     faster = [t for t in own if t.policy_hz > FIELD_TIMING.perception_hz]
     together = FIELD_TIMING._replace(synchronous=True)
-    end_s = told["times_s"][-1]
-    count = f"{told['worlds']} worlds, cost at {end_s:g} s over that with the field's rates"
+    end_s = data["times_s"][-1]
+    count = f"{data['worlds']} worlds, cost at {end_s:g} s over that with the field's rates"
     in_step = by_timing[together][-1]
     verdict = Agreement.OPEN
     if in_step.low >= 1.0 / _ASYNCHRONOUS:
@@ -270,15 +270,15 @@ def _asynchrony(told: Json) -> list[Claim]:
     claims = [
         Claim(
             "Asynchronous modules",
-            "Perception, exchange and control run each at a rate of its own, and no robot waits "
-            "for another.",
-            "Agrees if the whole 95 % interval of the extra cost of robots at their own moments "
-            f"lies below {100.0 * (_ASYNCHRONOUS - 1.0):.0f} %; differs if all of it lies above.",
-            f"{count}. All at the same moments: {ends([together])}.",
+            "Perception, exchange and control each run at their own rate, and no robot waits for "
+            "another.",
+            "Agrees if the whole 95 % interval of the extra cost of unsynchronised robots lies "
+            f"below {100.0 * (_ASYNCHRONOUS - 1.0):.0f} %; differs if all of it lies above.",
+            f"{count}. All synchronised: {ends([together])}.",
             verdict,
         )
     ]
-    for name, said, timings in (
+    for name, paper, timings in (
         ("An exchange slower than perception",
          "A slower exchange has a longer window in which to hear everybody.", slower),
         ("An exchange faster than perception",
@@ -292,7 +292,7 @@ def _asynchrony(told: Json) -> list[Claim]:
             claims.append(
                 Claim(
                     name,
-                    f"{said} Neither is measured.",
+                    f"{paper} Neither is measured.",
                     "It agrees if one such rate is better (its 95 % interval below 1), and differs "
                     "if all are worse.",
                     f"{count}. Perception at {FIELD_TIMING.perception_hz:g} Hz, exchange at "
@@ -306,12 +306,12 @@ def _asynchrony(told: Json) -> list[Claim]:
 def _network(network: Json) -> list[Claim]:
     where = network["measured_on"]["where"]
     air = (
-        "Measured on one machine's loopback, which has no radio: it says nothing of the air."
+        "Measured on one machine's loopback, which has no radio: not a result about the air."
         if where == "loopback"
         else "Measured between network namespaces."
     )
     restarts = {s["middleware"]: s for s in network["summaries"] if s["experiment"] == "restarts"}
-    said = ", ".join(
+    by_middleware = ", ".join(
         f"{name} {one['throughput_mbit_s']['mean']:.1f} Mbit/s"
         + (f", {100 * one['delivered']['mean']:.0f} % delivered" if "delivered" in one else "")
         for name, one in restarts.items()
@@ -321,12 +321,12 @@ def _network(network: Json) -> list[Claim]:
         for name, one in restarts.items()
         if name not in ("zenoh", "nothing")
     ]
-    # Runs before which robots had not met count for nothing.
+    # Runs of robots that had not met do not count.
     are_compared = bool(others) and "zenoh" in restarts
     doubled = are_compared and (restarts["zenoh"]["throughput_mbit_s"]["mean"] > 1.5 * max(others))
     curves = [s for s in network["summaries"] if s["experiment"] == "robots"]
     zenoh = sorted((s for s in curves if s["middleware"] == "zenoh"), key=lambda s: s["robots"])
-    told = ", ".join(f"{s['robots']}: {s['throughput_mbit_s']['mean']:.1f}" for s in zenoh)
+    by_robots = ", ".join(f"{s['robots']}: {s['throughput_mbit_s']['mean']:.1f}" for s in zenoh)
     are_several = len(zenoh) > 1
     falls = are_several and (
         zenoh[-1]["throughput_mbit_s"]["mean"] < zenoh[0]["throughput_mbit_s"]["mean"]
@@ -338,14 +338,14 @@ def _network(network: Json) -> list[Claim]:
             "83.3 ± 1.5 Mbit/s with zenoh, 43.2 ± 7.6 without it (ROS 2's default DDS; downlink "
             "82.9 and 42.7): three robots, 60 s, ten repetitions.",
             "With zenoh the stream gets more than 1.5 times what it gets with DDS.",
-            f"{said}. {air}",
+            f"{by_middleware}. {air}",
             Agreement.OPEN if on_loopback or not are_compared else _agrees(doubled),
         ),
         Claim(
             "Figure: throughput against the number of robots",
             "It falls as robots are switched on, one after another. No table.",
             "With the most robots it is lower than with one.",
-            f"Mbit/s by robots that run zenoh: {told}. {air}",
+            f"Mbit/s by robots that run zenoh: {by_robots}. {air}",
             Agreement.OPEN if on_loopback or not are_several else _agrees(falls),
         ),
     ]
@@ -353,7 +353,7 @@ def _network(network: Json) -> list[Claim]:
 
 def _team() -> Claim:
     wifi = Wifi()
-    said = ", ".join(
+    by_transport = ", ".join(
         f"{transport} {carries(transport, wifi, Traffic(robots=1), most_robots=1000)} robots"
         for transport in TRANSPORTS
     )
@@ -362,14 +362,14 @@ def _team() -> Claim:
         "One access point carried no more than ten robots.",
         "By our model of one Wi-Fi channel, ten take less than 60 % of it.",
         f"At 60 % of a channel of {wifi.data_rate_mbit_s:g} Mbit/s, by the model, which no radio "
-        f"was compared with: {said}. The paper's limit may have another cause: it does not say how "
-        "much its robots sent.",
+        f"was compared with: {by_transport}. The paper's limit may have another cause; it does not "
+        "give its robots' data rates.",
         Agreement.OPEN,
     )
 
 
 def printed_rotation(heading_rad: float) -> np.ndarray:
-    """Equation 4 as it is printed, R_z(3 pi / 2 - theta) R_x(pi): mission to north, east, down."""
+    """Equation 4 as printed, R_z(3 pi / 2 - theta) R_x(pi): mission to north, east, down."""
     angle = 1.5 * math.pi - heading_rad
     sin, cos = math.sin(angle), math.cos(angle)
     about_z = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -386,8 +386,8 @@ def _rotation() -> Claim:
     return Claim(
         "Equation 4: from the mission's frame to the autopilot's",
         "R_z(3π/2 - θ) R_x(π), θ being the compass heading of the mission's y axis.",
-        "The mission's y axis has to point to its heading.",
-        f"As it is printed, a robot that is told to fly along y goes {', '.join(parts[:-1])}, and "
+        "The mission's y axis must point along its heading.",
+        f"As printed, a robot with a command along y flies {', '.join(parts[:-1])}, and "
         f"{parts[-1]}. Ours is "
         "[[-sin θ, cos θ, 0], [cos θ, sin θ, 0], [0, 0, -1]], by the paper's own convention.",
         Agreement.MISTAKE,
@@ -402,6 +402,6 @@ def _density() -> Claim:
         "3.1e-5 robots per cell in training, 3.8e-4 in the field.",
         "Robots divided by cells.",
         f"{trained.robots} / {trained.world_size}² = {densities[0]:.1e}, and {field.robots} / "
-        f"{field.world_size}² = {densities[1]:.1e}: the second is a tenth of what is printed.",
+        f"{field.world_size}² = {densities[1]:.1e}: the second is a tenth of the printed value.",
         Agreement.MISTAKE,
     )

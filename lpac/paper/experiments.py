@@ -1,4 +1,4 @@
-"""The paper's experiments as studies: the files in `studies`, and what commands change of them."""
+"""The paper's experiments as studies: the files in `studies`, modified by options of commands."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ from lpac.study.file import condition_of, read_study
 from lpac.study.study import Condition, Method, Study
 
 _STUDIES = Path(__file__).with_name("studies")
-# Whole robots take longer; these experiments fly so much fewer worlds with them.
+# Whole robots take longer: these experiments fly fewer worlds with them, by these factors.
 _FEWER = {"async": 5, "transfer": 5}
 
 
@@ -18,11 +18,9 @@ def experiment(
     name: str, bundles: Sequence[Path], *, engine: EngineName = "point",
     px4_build: Path | None = None, quick: bool = False, set_ups: Sequence[str] = (),
 ) -> Study:  # fmt: skip
-    """The experiment of that name, flown by these bundles, as points or whole.
+    """Make the experiment of a name, flown by these bundles, as points or whole robots.
 
-    With `set_ups` its conditions are these.
-
-    Raises BundleError, ValueError, OSError.
+    `set_ups` replace its conditions. Raises BundleError, ValueError, OSError.
     """
     path = _STUDIES / (f"{name}-quick.toml" if quick else f"{name}.toml")
     study = read_study(path, px4_build, bundles[0])
@@ -36,9 +34,9 @@ def experiment(
 
 
 def _whole(name: str, study: Study, engine: EngineName) -> Study:
-    """The same with whole robots, in what these can do.
+    """The study with whole robots, without conditions that they cannot fly.
 
-    In E1 and for transfer points from the same pads are beside them.
+    E1 and transfer add points from the same pads.
     """
     conditions: list[Condition] = []
     for condition in study.conditions:

@@ -1,4 +1,4 @@
-"""The paper's experiments, from the logs of flights."""
+"""The paper's experiments, from logs of flights."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,28 +26,28 @@ from lpac.study.sections import Section, perturbation, repeatability, snapshots
 from lpac.study.study import BASELINES, Condition, Method, TrainedBundle
 from lpac.study.summary import LEGEND, draw_conditions, rows_of, tables_of
 
-LOGS = "From the logs of flights."
+LOGS = "From logs of flights."
 _BY_RATES = (
-    f"{LOGS} The missions of each rate are compared with those at the field's; costs are those of "
+    f"{LOGS} The missions of each rate are compared with those at the field's rates; costs are at "
     "the robots' estimated positions."
 )
 _BESIDE_POINTS = (
-    f"{LOGS} They are compared with points from where the robots were when the mission began."
+    f"{LOGS} They are compared with points from the robots' positions at the mission's begin."
 )
 _TAKEN = (
-    "From the log of a flight: a robot counts as taken while a pilot has it; for the cost it still "
-    "counts, at its place."
+    "From the log of a flight: a robot counts as taken while a pilot flies it; it still counts for "
+    "the cost, at its place."
 )
-# The paper looks at trials for so long from the takeoff command on, s.
+# Duration of the paper's trials, from the takeoff command on, s.
 _TRIAL_S = 40.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedMissions:
-    """Missions in the logs below a folder, by name, and the path of the bundle that flew them.
+    """Missions in the logs below a folder, by name, and the path of the flown bundle.
 
-    The report goes to `folder`, and says what it was `made_by`. Points fly over the `pool`. `note`
-    hears what a person should know besides.
+    The report goes to `folder`, with the provenance `made_by`. Points fly in the `pool`. `note` is
+    called with remarks for the user.
     """
 
     records: Mapping[str, FlightRecord]
@@ -59,39 +59,39 @@ class LoggedMissions:
     note: Callable[[str], object]
 
     def that_flew(self, why: str) -> Bundle:
-        """The bundle; `why` says what it is needed for.
+        """Load the bundle; `why` is the reason in errors.
 
-        Raises ValueError if another one flew, or it cannot fly.
+        Raises ValueError if another bundle flew, or it cannot fly.
         """
         bundle, flown = load_bundle(self.bundle), ids_in(self.records)
         if bundle.manifest.perception is None:
             raise ValueError(f"{self.bundle}: has no perception: it cannot fly")
         if len(flown) > 1:
             raise ValueError(
-                f"{' and '.join(its[:16] for its in flown)} flew: choose missions of one bundle "
-                "with --trial"
+                f"missions were flown by {' and '.join(its[:16] for its in flown)}: choose those "
+                "of one bundle with --trial"
             )
         if bundle.id not in flown:
             raise ValueError(
-                f"{self.bundle}: is not what flew, {flown[0][:16]}: give that with --bundle, {why}"
+                f"{self.bundle}: another bundle flew, {flown[0][:16]}: give it with --bundle, {why}"
             )
         return bundle
 
 
 def ids_in(records: Mapping[str, FlightRecord]) -> list[str]:
-    """The ids of the bundles that flew."""
+    """Ids of the flown bundles."""
     robots = [robot for record in records.values() for robot in record.robots]
     return sorted({status.bundle_id for robot in robots for status in robot.statuses})
 
 
 def _e1(of: LoggedMissions) -> Report:
-    """E1: each mission, beside the baselines over its world if the bundle flew it."""
+    """E1: each mission, with baselines over its world if the bundle flew it."""
     bundle = load_bundle(of.bundle)
     others = [name for name, record in of.records.items() if ids_in({name: record}) != [bundle.id]]
     if others:
         of.note(
-            f"{of.bundle} is not what flew {', '.join(others)}, so what baselines would see there "
-            "is not known: they are left out; give the bundle that flew with --bundle"
+            f"no baselines for {', '.join(others)}: another bundle than {of.bundle} flew, so their "
+            "sizes are unknown; give that bundle with --bundle"
         )
     own = {name: record for name, record in of.records.items() if name not in others}
     beside = _baselines_beside(own, of, sizes_of(bundle), BASELINES)
@@ -110,10 +110,10 @@ def _baselines_beside(
     sizes: str,
     names: Sequence[BaselineName],
 ) -> dict[str, dict[str, FlightRecord]]:
-    """Baselines over the world of each logged flight, from where its robots began, as points.
+    """Baselines over the world of each logged flight, from its robots' first positions, as points.
 
-    They fly at the field's scale of speeds, with a bundle's sizes. Flights whose world is not
-    there, or that nobody began, are left out.
+    They fly at the field's speed scale, with a bundle's sizes. Flights without a world, or without
+    robots in the air at their begin, are skipped.
     """
     flights = {
         (mission, name): PlannedFlight(scenario=scenario, bundle=str(of.bundle), flown_by=sizes)
@@ -155,13 +155,13 @@ def _e2(of: LoggedMissions) -> Report:
 
 
 def _e3(of: LoggedMissions) -> Report:
-    """E3: robots are away while pilots have them.
+    """E3: robots are away while pilots fly them.
 
-    Raises ValueError if nobody was, or there are several missions.
+    Raises ValueError if none was, or there are several missions.
     """
     if len(of.records) > 1:
         raise ValueError(f"{of.logs}: has {', '.join(of.records)}: choose one mission with --trial")
-    perception = of.that_flew("which says how far robots hear each other").manifest.perception
+    perception = of.that_flew("which has the communication range").manifest.perception
     assert perception is not None
     range_m = perception.communication_range / FIELD_SCALE.env_scale
     [record] = of.records.values()
@@ -170,8 +170,8 @@ def _e3(of: LoggedMissions) -> Report:
 
 
 def _async(of: LoggedMissions) -> Report:
-    """Missions by the rates that they were flown at. Raises ValueError."""
-    bundle = of.that_flew("which says how much robots say")
+    """Missions by their rates. Raises ValueError."""
+    bundle = of.that_flew("which has the size of messages")
     for name, record in of.records.items():
         if not is_comparable(record):
             why = (
@@ -180,26 +180,26 @@ def _async(of: LoggedMissions) -> Report:
                 else f"it lasted {record.curve_time_s[-1]:.0f} s, less than {LOGGED_S:g}"
             )
             of.note(f"{name} is left out: {why}")
-    said = message_bytes(bundle, 2)
-    section = rates(results_of_logs(of.records), said, of.folder, paired=False)
+    message_size = message_bytes(bundle, 2)
+    section = rates(results_of_logs(of.records), message_size, of.folder, paired=False)
     return section.report("async", "Rates and asynchrony", _BY_RATES, of.made_by)
 
 
 def _transfer(of: LoggedMissions) -> Report:
-    """Missions by team, how many robots and features, beside ClairvoyantCVT's flights.
+    """Missions by team (numbers of robots and features), with ClairvoyantCVT's flights.
 
-    Raises ValueError if nobody was in the air as one began.
+    Raises ValueError if a mission began without robots in the air.
     """
-    bundle = of.that_flew("which says what baselines see")
+    bundle = of.that_flew("which has the baselines' sizes")
     beside = _baselines_beside(of.records, of, sizes_of(bundle), [CLAIRVOYANT])
     for name in of.records:
         if name not in beside:
-            raise ValueError(f"{name}: nobody was in the air as it began: choose other missions")
+            raise ValueError(f"{name}: no robot was in the air at its begin: choose other missions")
     clairvoyant = {name: its[CLAIRVOYANT] for name, its in beside.items()}
     path = str(of.bundle.resolve())
     policy = Method(name="lpac", trainings=(TrainedBundle(path, bundle.id),))
     results = _by_team(of.records, clairvoyant, policy)
-    told: dict[str, Any] = {
+    data: dict[str, Any] = {
         "world_set": None,
         "first_world": 0,
         "worlds": len(of.records),
@@ -211,7 +211,7 @@ def _transfer(of: LoggedMissions) -> Report:
         "fails_above": FAILS_ABOVE,
         "conditions": conditions_json(results),
     }
-    section = Section(told, tables_of(told), draw_conditions(results, of.folder), rows_of(told))
+    section = Section(data, tables_of(data), draw_conditions(results, of.folder), rows_of(data))
     title = "Transfer to other teams and worlds"
     return replace(section.report("transfer", title, _BESIDE_POINTS, of.made_by), legend=LEGEND)
 
@@ -219,9 +219,9 @@ def _transfer(of: LoggedMissions) -> Report:
 def _by_team(
     missions: Mapping[str, FlightRecord], clairvoyant: Mapping[str, FlightRecord], policy: Method
 ) -> dict[Condition, list[MethodResult]]:
-    """By team, the smallest first: the missions that the policy flew, and ClairvoyantCVT's flights.
+    """By team, the smallest first: missions flown by the policy, and ClairvoyantCVT's flights.
 
-    Both are by mission, and looked at for as long as the shortest mission lasted.
+    Both are by mission, and cut to the shortest mission.
     """
     duration_s = min(float(record.curve_time_s[-1]) for record in missions.values())
     time_s = cost_times_s(duration_s)
@@ -255,7 +255,7 @@ def _by_team(
 
 
 def _curves(records: Sequence[FlightRecord], time_s: F64) -> F64:
-    """(1, K, C): normalised costs."""
+    """Normalised costs (1, K, C)."""
     return np.array([[np.interp(time_s, r.curve_time_s, r.normalized) for r in records]])
 
 

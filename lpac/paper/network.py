@@ -1,14 +1,15 @@
-"""The network experiment's report, beside the figures of `lpac bench network`."""
+"""Report of the network experiment, with the figures of `lpac bench network`."""
 
 from collections.abc import Mapping
 from typing import Any
 
+from edge.core.counted import counted
 from lpac.study.report import Picture, Report, Table
 
 
-def network_report(told: Mapping[str, Any], made_by: Mapping[str, str]) -> Report:
-    """Of what `lpac bench network` measured, whose JSON is `told`."""
-    measured_on = told["measured_on"]
+def network_report(data: Mapping[str, Any], made_by: Mapping[str, str]) -> Report:
+    """Make the report from the JSON of `lpac bench network`."""
+    measured_on = data["measured_on"]
     where = "on this machine's loopback, which has no radio"
     if measured_on["where"] != "loopback":
         where = f"between network namespaces ({', '.join(measured_on['namespaces'])})"
@@ -17,23 +18,23 @@ def network_report(told: Mapping[str, Any], made_by: Mapping[str, str]) -> Repor
         [of["experiment"], of["middleware"], str(of["robots"]),
          _spread(of.get("throughput_mbit_s")), _spread(of.get("delivered"), 100.0),
          _spread(of.get("age_p50_ms"))]
-        for of in told["summaries"]
+        for of in data["summaries"]
     ]  # fmt: skip
     headings = ["", "", "robots", "Mbit/s", "delivered, %", "age p50, ms"]
     versions = ", ".join(f"{name} {version}" for name, version in measured_on["versions"].items())
-    unmet = sum(not run["met"] for run in told["runs"])
-    not_met = f"Runs left out, before which not all robots had met: {unmet}. " if unmet else ""
+    unmet = sum(not run["met"] for run in data["runs"])
+    not_met = f"{counted(unmet, 'run')} left out: not all robots had met. " if unmet else ""
     note = (
         f"Mean and standard deviation over the runs. {not_met}{versions}; Linux "
         f"{measured_on['kernel']}, {measured_on['cores']} cores."
     )
-    runs = told["runs"]
+    runs = data["runs"]
     return Report(
         name="network",
         title="Network",
         text="The paper measures what a stream gets while the programs of three robots restart "
         "(Table I), and how that falls as robots are switched on one after another. " + flown,
-        data=told,
+        data=data,
         rows=[list(runs[0]), *(list(run.values()) for run in runs)],
         tables=[Table(headings, rows, note=note)],
         figures=[

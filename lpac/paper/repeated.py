@@ -1,4 +1,4 @@
-"""The paper, repeated: what its experiments left in a folder, as one page that holds everything."""
+"""The page of the repeated paper: all experiments in a folder on one self-contained page."""
 
 import itertools
 import json
@@ -14,14 +14,14 @@ from lpac.analysis.template import render
 from lpac.paper.claims import Effort, Sizes, claims_of
 from lpac.study.receiving_robot import ReceivingRobot, message_bytes
 
-# Of which the median is how long one takes.
+# Number of steps whose median is a step's time.
 _STEPS = 100
 TITLE = "The paper, repeated"
 
 
 @dataclass(frozen=True, slots=True)
 class Chapter:
-    """An experiment of the page: its command, what it is, and its figures' captions.
+    """A section of the page: an experiment's command, title, and captions of its figures.
 
     Its JSON is NAME/NAME.json.
     """
@@ -36,9 +36,9 @@ CHAPTERS = (
         "e1", "E1, transferability",
         {
             "snapshots": "Three worlds that no policy was trained on, at 0, 15, 30 and 60 s: "
-            "robots, their paths and Voronoi cells over the density, which is faint where no "
-            "robot had looked by then.",
-            "costs": "Coverage cost over that at the start, beside the baselines.",
+            "robots, their paths and Voronoi cells over the density, which is faint where it was "
+            "not yet seen.",
+            "costs": "Coverage cost over the initial cost, with the baselines.",
         },
     ),
     Chapter(
@@ -51,31 +51,30 @@ CHAPTERS = (
     ),
     Chapter(
         "transfer", "Transfer to other teams and worlds",
-        {"conditions": "Mean cost at the end over clairvoyant Lloyd's, with 95 % intervals."},
+        {"conditions": "Mean final cost over clairvoyant Lloyd's, with 95 % intervals."},
     ),
     Chapter(
         "async", "Rates and asynchrony",
         {
             "rates": "Cost over the policy's rate, relative to that at the field's rates. Solid "
-            "lines: each robot at its own moments; dashed: all robots in step.",
-            "staleness": "At the field's rates, with messages that are late.",
+            "lines: unsynchronised robots; dashed: synchronised.",
+            "staleness": "At the field's rates, with late messages.",
         },
     ),
     Chapter(
         "network", "Network",
         {
             "restarts": "What a stream between two robots gets while all programs restart.",
-            "robots": "The same over the number of robots, and how old their messages are.",
+            "robots": "The same over the number of robots, and the age of their messages.",
         },
     ),
 )  # fmt: skip
 
 
 def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, str]]) -> Path:
-    """index.html and claims.json of what lies in `folder`; gives the page's path.
+    """Write index.html and claims.json from the results in `folder`; returns the page's path.
 
-    `made_by` says of each experiment what made it; one that is missing there is left out. Raises
-    OSError.
+    `made_by` has the provenance of each experiment; others are left out. Raises OSError.
     """
     documents = {
         chapter.name: json.loads((folder / chapter.name / f"{chapter.name}.json").read_text())
@@ -83,11 +82,11 @@ def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, 
         if chapter.name in made_by
     }
     claims = claims_of(documents, sizes_of(bundle), effort_of(bundle))
-    told = {
+    document = {
         "claims": [asdict(claim) for claim in claims],
         "made_by": {name: dict(its) for name, its in made_by.items()},
     }
-    (folder / "claims.json").write_text(json.dumps(told, indent=2) + "\n")
+    (folder / "claims.json").write_text(json.dumps(document, indent=2) + "\n")
     path = folder / "index.html"
     chapters = [chapter for chapter in CHAPTERS if chapter.name in documents]
     path.write_text(
@@ -102,15 +101,15 @@ def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, 
 
 
 def sizes_of(bundle: Bundle) -> Sizes:
-    """Of the messages of a bundle's policy. Raises BundleError if no robot can fly it."""
+    """Sizes of a policy's messages. Raises BundleError if robots cannot fly it."""
     return Sizes(*(message_bytes(bundle, others) for others in (2, 100)))
 
 
 def effort_of(bundle: Bundle) -> Effort:
-    """Of a bundle's policy, medians, on this machine. Raises BundleError if no robot can fly it."""
+    """Median times of a policy on this machine. Raises BundleError if robots cannot fly it."""
     robots = [ReceivingRobot(others, bundle) for others in (2, 100)]
     took_s = np.zeros((_STEPS, len(robots)))
-    # In turns, so that what else the machine does meanwhile hits both.
+    # Alternate, so that other load on the machine affects both.
     for step, number in itertools.product(range(_STEPS), range(len(robots))):
         began_s = time.perf_counter()
         robots[number].step()
@@ -119,6 +118,6 @@ def effort_of(bundle: Bundle) -> Effort:
 
 
 def _pictures(folder: Path, chapter: Chapter) -> dict[str, bytes]:
-    """PNG by figure, of those that were drawn."""
+    """PNG of each existing figure, by name."""
     paths = {name: folder / chapter.name / f"{name}.png" for name in chapter.figures}
     return {name: path.read_bytes() for name, path in paths.items() if path.exists()}

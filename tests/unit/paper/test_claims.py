@@ -1,4 +1,4 @@
-"""What the experiments say of the paper's claims, and the page that tells it."""
+"""Verdicts on the paper's claims, and the page with them."""
 
 import html
 import json
@@ -46,7 +46,7 @@ def of_worlds(*costs: list[float]) -> dict[str, Any]:
 
 
 def of_whole_robots(cost: list[float]) -> dict[str, Any]:
-    """Beside points that come down in time."""
+    """Costs of whole robots, with points that settle in time."""
     return {
         "flights": {
             name: {WHOLE_ROBOTS: flight(cost), **points}
@@ -163,7 +163,7 @@ def test_what_the_data_do_not_tell_is_not_told() -> None:
         assert claim(on_loopback, name).verdict is Agreement.OPEN
     undecided = {"async": rates(1.0, 1.0, 1.0)}
     assert claim(undecided, "An exchange slower").verdict is Agreement.OPEN
-    # Robots in step at 0.95 times the cost, and the interval does not say which side of 5 % it is.
+    # Synchronised robots have 0.95 times the cost, with an interval on both sides of 5 %.
     in_step = {"async": rates(0.95, 1.0, 1.0)}
     assert claim(in_step, "Asynchronous").verdict is Agreement.OPEN
     names = [claim.name for claim in claims_of({}, SIZES, EFFORT)]
@@ -261,7 +261,7 @@ def test_what_was_made_is_not_made_again(
     assert sorted(asked) == sorted(documents)
     lpac.cli.paper.everything(quick=True, out=tmp_path)
     assert len(asked) == len(documents)
-    # What is not quick is something else.
+    # Results other than quick ones are made again.
     lpac.cli.paper.everything(out=tmp_path)
     assert sorted(asked[len(documents) :]) == sorted(documents)
     assert capsys.readouterr().out.endswith(f"see {tmp_path / 'index.html'}\n")

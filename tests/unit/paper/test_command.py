@@ -1,4 +1,4 @@
-"""`lpac paper` on the logs of a field day, and what it leaves beside its figures."""
+"""`lpac paper` on the logs of a field day, and its files."""
 
 import csv
 import json
@@ -38,7 +38,7 @@ def said(time_s: float, bundle_id: str) -> LoggedStatus:
 
 @pytest.fixture
 def mission() -> FlightRecord:
-    """Of two robots, as logs have it."""
+    """A mission of two robots, as in logs."""
     bundle = load_bundle(DEFAULT_BUNDLE)
     record = fly_points(Scenario(robots=2, duration_s=5.0), bundle)
     coverage = record.coverage
@@ -53,7 +53,7 @@ def mission() -> FlightRecord:
 
 @pytest.fixture
 def day(mission: FlightRecord, monkeypatch: pytest.MonkeyPatch) -> list[Wanted]:
-    """Logs of two missions, the second over a world that is not there; gives what was wanted."""
+    """Logs of two missions, the second over a missing world; returns the requested scopes."""
     asked: list[Wanted] = []
 
     def examine(_: Sequence[Path], wanted: Wanted) -> Examined:
@@ -82,7 +82,7 @@ def test_a_world_that_is_not_there_is_one_line_that_says_what_to_do(
 def test_one_mission_of_a_day_is_chosen_and_its_own_policy_named(tmp_path: Path) -> None:
     e3(logs=Path("day 1"), trial=["paper-1"], out=tmp_path)
     made_by = json.loads((tmp_path / "e3.json").read_text())["made_by"]
-    # What played no part in it is not there.
+    # Files of other experiments do not exist.
     assert made_by["command"] == "lpac paper e3 --logs 'day 1' --trial paper-1"
     assert made_by["bundle"] == load_bundle(DEFAULT_BUNDLE).id and "seeds" not in made_by
     assert {"numpy", "onnxruntime", "python", "lpac-edge"} < set(made_by)
@@ -101,7 +101,7 @@ def test_a_logged_flight_is_held_against_baselines_from_where_it_began(
     for its in of_world.values():
         assert its["time_s"] == flown["time_s"] and its["normalized_cost"][0] == 1.0
     assert of_world["clairvoyant-cvt"]["final"] < min(1.0, flown["final"])
-    assert "points from where the robots were" in told["flown"]
+    assert "points from the robots' positions" in told["flown"]
 
 
 def of_another_policy(mission: FlightRecord) -> FlightRecord:
@@ -128,7 +128,7 @@ def test_a_logged_flight_of_another_policy_has_no_baselines(
     told = json.loads((tmp_path / "e1.json").read_text())
     assert [list(of_world) for of_world in told["flights"].values()] == [["flight"]]
     assert told["flown"] == LOGS
-    assert "give the bundle that flew with --bundle" in capsys.readouterr().err
+    assert "give that bundle with --bundle" in capsys.readouterr().err
 
 
 def test_of_a_day_with_two_policies_each_mission_is_looked_at_by_itself(
@@ -141,8 +141,8 @@ def test_of_a_day_with_two_policies_each_mission_is_looked_at_by_itself(
     e1(logs=tmp_path, out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
     assert [len(of_world) for of_world in told["flights"].values()] == [1, 1 + len(BASELINES)]
-    assert "is not what flew paper-0," in capsys.readouterr().err
-    # Who did not fly has an empty cell.
+    assert "no baselines for paper-0" in capsys.readouterr().err
+    # Methods that did not fly have an empty cell.
     assert "|  |  |" in (tmp_path / "README.md").read_text()
 
 
@@ -169,7 +169,7 @@ def test_missions_are_put_together_by_their_rates(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    """Of a minute each; one whose logs do not tell how often its robots decided is left out."""
+    """Of a minute each; one without rates in its logs is left out."""
     minute_s = mission.cost_time_s * 12.0
     robots = tuple(replace(robot, time_s=robot.time_s * 12.0) for robot in mission.robots)
     record = replace(mission, duration_s=60.0, to_s=60.0, cost_time_s=minute_s, robots=robots)
@@ -209,7 +209,7 @@ def test_neighbours_are_those_in_range_of_the_policy_that_flew(
     mission: FlightRecord, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     read_from_logs(monkeypatch, of_another_policy(mission))
-    with pytest.raises(ValueError, match="is not what flew, 0123456789abcdef: give that with --b"):
+    with pytest.raises(ValueError, match="another bundle flew, 0123456789abcdef: give it with --b"):
         e3(logs=tmp_path, out=tmp_path)
 
 
@@ -257,4 +257,4 @@ def test_a_measured_network_gets_its_table_and_what_made_it(tmp_path: Path) -> N
     }  # fmt: skip
     text = (tmp_path / "README.md").read_text()
     assert "| robots | zenoh | 2 | 75.0 ± 0.5 |  |  |" in text and "(robots.png)" in text
-    assert "Runs left out, before which not all robots had met: 1." in text
+    assert "1 run left out: not all robots had met." in text
