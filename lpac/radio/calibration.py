@@ -1,22 +1,21 @@
-"""Calibration of the radio model by a field's own records.
+"""Calibrates the radio model with records of the field.
 
-`read_wifi` takes a TOML file of `Wifi` values, or a file of a field's `RadioRecord`s, from which
-`calibrated` takes what they can say:
+`read_wifi` reads a TOML file of `Wifi` values, or a file of `RadioRecord`s, from which `calibrated`
+estimates:
 
-- `data_rate_mbit_s` from the radios' rates: the one at which the same bytes take as long as at all
-  of them, their harmonic mean. Where no radio told its rate, the one at which the model of a mesh
-  keeps the channel as busy as it was.
-- `multicast_rate_mbit_s`, if the data rate is known so: the one at which the model of multicast
-  keeps the channel as busy as it was.
-- `frame_loss` from multicast: the one at which the model delivers as much as arrived. In a mesh
-  what is lost is repeated, so that nobody sees it.
+- `data_rate_mbit_s` from the radios' rates: their harmonic mean, at which the same bytes take the
+  same time. Without rates, the value at which the model of a mesh is as busy as the channel.
+- `multicast_rate_mbit_s`, if the data rate is known: the value at which the model of multicast is
+  as busy as the channel.
+- `frame_loss` from multicast: the value at which the model delivers as much as arrived. A mesh
+  repeats lost frames and hides them.
 
-The rest stays assumed: what a full queue is worth would take a channel that somebody fills, whose
-traffic is in no record. For the same reason records beside a bulk stream are left out. Each record
-is held against the model with its own `ground_wired`. Channels more than half busy are left to the
-radios' rates alone, since what waits is sent together then, and the model is at its worst. It knows
-no distances: what is found is a mean over the pairs and places that were recorded, and a channel
-that other networks keep busy looks slow.
+Other values stay assumed: the capacity of a full queue would need a saturated channel, whose
+traffic is not recorded. Records beside a bulk stream are ignored for this reason. Each record is
+compared with the model with its own `ground_wired`. Of channels more than half busy only the
+radios' rates are used: waiting messages are sent together then, and the model is at its worst. It
+knows no distances: results are means over the recorded pairs and places, and a channel used by
+other networks looks slow.
 """
 
 import math
@@ -37,9 +36,9 @@ from lpac.radio.airtime import Traffic, Transport, Wifi, airtime, link_quality
 from lpac.radio.records import RadioRecord, read_records
 
 _MOST_BUSY = 0.5
-# Between these a value is looked for.
+# Search intervals.
 _RATES_MBIT_S, _LOSSES = (0.1, 1e5), (0.0, 0.99)
-# Each value depends a little on the others.
+# Number of iterations: each value depends a little on the others.
 _ROUNDS = 3
 
 
@@ -54,7 +53,7 @@ class SourceKind(StrEnum):
 
 
 class Source(NamedTuple):
-    """Of one value; `records` counts those that it comes from, if any."""
+    """Origin of one value; `records` is the number of its records, if any."""
 
     kind: SourceKind
     records: int = 0
@@ -62,17 +61,17 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A channel, and by the name of each of its values where that comes from."""
+    """A channel, and the origin of each value by name."""
 
     wifi: Wifi
     sources: Mapping[str, Source]
 
 
 def read_wifi(path: Path | None) -> Calibration:
-    """Of a .toml or a .jsonl file; without a path, all of it is assumed.
+    """Read a .toml or .jsonl file; without a path, all values are assumed.
 
     Raises OSError; ConfigError that names file, key, value and what is allowed, also for records
-    that say nothing of what is assumed, and for those of no radio.
+    without information about assumed values, or without a radio.
     """
     if path is None:
         return _calibration(Wifi(), {})
@@ -80,12 +79,12 @@ def read_wifi(path: Path | None) -> Calibration:
         records = read_records(path)
         if records and not any(record.is_of_radio for record in records):
             raise ConfigError(
-                f"{path}: these records are not of a radio: none told of signal, rate or how busy "
-                "the channel was, as with robots of `lpac sim`"
+                f"{path}: no record has a radio's signal, rate or channel load, as with robots of "
+                "`lpac sim`"
             )
         found = calibrated(records)
         if all(source.kind is SourceKind.ASSUMED for source in found.sources.values()):
-            raise ConfigError(f"{path}: no record says anything of what the model assumes")
+            raise ConfigError(f"{path}: no record has information about the model's values")
         return found
     if path.suffix != ".toml":
         raise ConfigError(
@@ -97,9 +96,9 @@ def read_wifi(path: Path | None) -> Calibration:
 
 
 def calibrated(records: Sequence[RadioRecord], assumed: Wifi | None = None) -> Calibration:
-    """Calibrate by records, from what is `assumed`: if not given, what `Wifi` has."""
+    """Calibrate with records, starting from `assumed`, by default the values of `Wifi`."""
     wifi, sources = assumed or Wifi(), dict[str, Source]()
-    # What a bulk stream takes of the channel, and does to messages, is not in the model.
+    # The model does not include a bulk stream.
     records = [each for each in records if not each.loaded]
     for _ in range(_ROUNDS):
         for name, find in _FINDERS:
@@ -141,12 +140,12 @@ def _multicast_rate(records: Sequence[RadioRecord], wifi: Wifi) -> _Found | None
 def _by_busy(
     name: str, records: Sequence[RadioRecord], transport: Transport, wifi: Wifi
 ) -> _Found | None:
-    told = [
+    known = [
         each
         for each in records
         if each.transport == transport and each.busy_share is not None and _is_quiet(each)
     ]
-    busy = _means(told, lambda record: record.busy_share or 0.0)
+    busy = _means(known, lambda record: record.busy_share or 0.0)
 
     def too_busy(rate_mbit_s: float) -> float:
         changed = _with(wifi, name, rate_mbit_s)
@@ -155,15 +154,15 @@ def _by_busy(
             for (transport, wired, traffic), (share, count) in busy.items()
         )
 
-    rate_mbit_s = _where_zero(too_busy, *_RATES_MBIT_S) if told else None
-    return None if rate_mbit_s is None else _Found(rate_mbit_s, Source(SourceKind.BUSY, len(told)))
+    rate_mbit_s = _where_zero(too_busy, *_RATES_MBIT_S) if known else None
+    return None if rate_mbit_s is None else _Found(rate_mbit_s, Source(SourceKind.BUSY, len(known)))
 
 
 def _frame_loss(records: Sequence[RadioRecord], wifi: Wifi) -> _Found | None:
-    heard = [each for each in records if each.transport == "multicast" and _is_quiet(each)]
-    if not heard:
+    usable = [each for each in records if each.transport == "multicast" and _is_quiet(each)]
+    if not usable:
         return None
-    delivered = _means(heard, lambda record: record.received / record.sent)
+    delivered = _means(usable, lambda record: record.received / record.sent)
 
     def too_much(frame_loss: float) -> float:
         changed = _with(wifi, "frame_loss", frame_loss)
@@ -173,10 +172,10 @@ def _frame_loss(records: Sequence[RadioRecord], wifi: Wifi) -> _Found | None:
             total += count * (1.0 - quality.loss - share)
         return total
 
-    # More arrived than the model's collisions let through, or next to nothing.
+    # At a bound: more arrived than the model's collisions allow, or almost nothing did.
     least, most = _LOSSES
     loss = least if too_much(least) <= 0.0 else _where_zero(too_much, least, most)
-    return _Found(most if loss is None else loss, Source(SourceKind.DELIVERED, len(heard)))
+    return _Found(most if loss is None else loss, Source(SourceKind.DELIVERED, len(usable)))
 
 
 _FINDERS: tuple[tuple[str, Callable[[Sequence[RadioRecord], Wifi], _Found | None]], ...] = (
@@ -190,25 +189,25 @@ def _is_quiet(record: RadioRecord) -> bool:
     return record.busy_share is None or record.busy_share <= _MOST_BUSY
 
 
-# What the model tells records apart by: the bool is `ground_wired`.
-_Alike = tuple[Transport, bool, Traffic]
+# Key of records that are equal to the model; the bool is `ground_wired`.
+_Key = tuple[Transport, bool, Traffic]
 
 
 def _means(
     records: Iterable[RadioRecord], value: Callable[[RadioRecord], float]
-) -> dict[_Alike, tuple[float, int]]:
-    """Of records that the model cannot tell apart: the mean, and how many they are."""
-    alike: defaultdict[_Alike, list[float]] = defaultdict(list)
+) -> dict[_Key, tuple[float, int]]:
+    """Mean value and number of records for each key."""
+    values_of: defaultdict[_Key, list[float]] = defaultdict(list)
     for each in records:
         traffic = Traffic(
             robots=each.robots, message_bytes=each.message_bytes, message_hz=each.message_hz
         )
-        alike[each.transport, each.ground_wired, traffic].append(value(each))
-    return {key: (fmean(values), len(values)) for key, values in alike.items()}
+        values_of[each.transport, each.ground_wired, traffic].append(value(each))
+    return {key: (fmean(values), len(values)) for key, values in values_of.items()}
 
 
 def _where_zero(falling: Callable[[float], float], low: float, high: float) -> float | None:
-    """None if it is not above 0 at `low` and below at `high`."""
+    """Root of a falling function; None if there is no change of sign."""
     if not falling(low) > 0.0 > falling(high):
         return None
     return float(scipy.optimize.brentq(falling, low, high, xtol=1e-9))

@@ -1,7 +1,7 @@
-"""Links between robots over some time, by their own statuses.
+"""Quality of the links between robots over some time, from their own statuses.
 
-Robots count for themselves what arrives and how old it is (`edge.core.arrivals`); here two of a
-robot's statuses are compared. Nobody has to be asked anything.
+Robots count arrived messages and their ages (`edge.core.arrivals`). Two statuses of a robot are
+compared here; no request to robots is needed.
 """
 
 from collections import Counter
@@ -11,54 +11,54 @@ from typing import NamedTuple
 from edge.core.arrivals import Arrivals
 from edge.messages.mission import RadioCounts, RobotStatus
 
-# Messages are forgotten at this age.
+# Robots discard messages at this age.
 LATE_S = 0.8
-# Of two robots' statuses neither tells of the same moment, and some messages are on their way.
+# Statuses of two robots are from different times, and some messages are in transit.
 _APART_S = 1.0
-# Of so many links that are all bad, what they have in common is to blame.
+# At least so many bad links must share a robot to blame it.
 _LEAST_LINKS = 2
 
-# Of a sender and a receiver, by their names.
+# Names of a sender and a receiver.
 Link = tuple[str, str]
 
 
 class Window(NamedTuple):
-    """The first and the last status with `radio_counts` of one start of a program in some time."""
+    """First and last status with `radio_counts` of one start of a program in some time."""
 
     first: RobotStatus
     last: RobotStatus
 
     @property
     def counts(self) -> tuple[RadioCounts, RadioCounts]:
-        """At its begin, and at its end."""
+        """Counts at the begin and at the end."""
         first, last = self.first.radio_counts, self.last.radio_counts
         assert first is not None and last is not None
         return first, last
 
     @property
     def duration_s(self) -> float:
-        """By the robot's own clock."""
+        """Duration by the robot's own clock."""
         return self.last.uptime_s - self.first.uptime_s
 
     @property
     def sent(self) -> int:
-        """How many messages its policy had for the others."""
+        """Number of messages of its policy."""
         first, last = self.counts
         return last.sent - first.sent
 
     @property
     def bytes_sent(self) -> int:
-        """Bytes of these together, without envelopes."""
+        """Bytes of these messages, without envelopes."""
         first, last = self.counts
         return last.sent_bytes - first.sent_bytes
 
     @property
     def rate_hz(self) -> float:
-        """How often it had one."""
+        """Rate of its messages."""
         return self.sent / self.duration_s if self.duration_s > 0.0 else 0.0
 
     def arrivals(self, sender: int) -> Arrivals:
-        """Arrivals of a robot's messages, by its id."""
+        """Arrivals of the messages of a robot, by its id."""
         first, last = (
             Arrivals.of_counts(counts.arrivals.get(str(sender), ())) for counts in self.counts
         )
@@ -66,8 +66,8 @@ class Window(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Of `sent` messages that were for the receiver `received` came, `late` of them at 0.8 s or
-    older. Ages are None if none is known; see `Arrivals.age_s`."""
+    """Of `sent` messages to the receiver, `received` arrived, `late` of them at an age of 0.8 s or
+    more. Ages are None if unknown; see `Arrivals.age_s`."""
 
     sender: str
     receiver: str
@@ -79,22 +79,22 @@ class Pair(NamedTuple):
 
     @property
     def delivered(self) -> float:
-        """The share that came, however late."""
+        """Share that arrived at any age."""
         return self.received / self.sent
 
     @property
     def late_share(self) -> float:
-        """Of those that came, the share that was late."""
+        """Share of the arrived messages that was late."""
         return self.late / self.received if self.received else 0.0
 
     @property
     def in_time(self) -> float:
-        """The share that came before it was late."""
+        """Share that arrived in time."""
         return (self.received - self.late) / self.sent
 
 
 def pairs(windows: Mapping[str, Window]) -> tuple[Pair, ...]:
-    """Of each two robots of which one spoke; by names. The windows are of about the same time."""
+    """Pairs by name of which the sender sent; windows must be of about the same time."""
     found = (
         _pair(sender, receiver, windows[sender], windows[receiver])
         for receiver in windows
@@ -104,13 +104,13 @@ def pairs(windows: Mapping[str, Window]) -> tuple[Pair, ...]:
     return tuple(pair for pair in found if pair is not None)
 
 
-def _pair(sender: str, receiver: str, said: Window, heard: Window) -> Pair | None:
-    arrivals = heard.arrivals(said.last.robot_id)
-    # The receiver knows best which are missing between those that came. Of what came before or
-    # after them, and of what never comes, the sender's own count tells.
-    expected, apart = said.rate_hz * heard.duration_s, said.rate_hz * _APART_S + 1.0
+def _pair(sender: str, receiver: str, sent_in: Window, received_in: Window) -> Pair | None:
+    arrivals = received_in.arrivals(sent_in.last.robot_id)
+    # The receiver knows best about losses between arrived messages. The sender's count tells about
+    # those before, after, and about lost links.
+    expected, apart = sent_in.rate_hz * received_in.duration_s, sent_in.rate_hz * _APART_S + 1.0
     sent = round(min(max(arrivals.sent, expected - apart), expected + apart))
-    if said.sent < 1 or sent < 1:
+    if sent_in.sent < 1 or sent < 1:
         return None
     received = max(0, min(arrivals.arrived, sent))
     return Pair(
@@ -125,9 +125,9 @@ def _pair(sender: str, receiver: str, said: Window, heard: Window) -> Pair | Non
 
 
 class Blame(NamedTuple):
-    """Where bad links have their cause.
+    """Causes of bad links.
 
-    `receivers` hear nobody well, `senders` nobody hears well; `links` are the others.
+    `receivers` receive badly from all, `senders` are received badly by all; `links` are the others.
     """
 
     receivers: tuple[str, ...]
@@ -136,13 +136,13 @@ class Blame(NamedTuple):
 
 
 def blame(is_good: Mapping[Link, bool]) -> Blame:
-    """Explain bad links by few robots, among all links that there should be."""
+    """Explain bad links by few robots, given all links that should exist."""
     left = {link for link, good in is_good.items() if not good}
     found: tuple[list[str], list[str]] = [], []  # senders, receivers
     while True:
         best: tuple[int, int, str] | None = None
         for side in (1, 0):
-            # Links that somebody else explains speak neither for a robot nor against it.
+            # Links that are explained already count neither for nor against a robot.
             bad = Counter(link[side] for link in left)
             good = {link[side] for link, is_good_one in is_good.items() if is_good_one}
             for name in sorted(bad.keys() - good):

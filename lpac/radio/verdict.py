@@ -1,4 +1,4 @@
-"""Verdict of a check of the radio: one sentence, and what is wrong, the worst first."""
+"""Verdict of a radio check: one sentence, and the problems, worst first."""
 
 import dataclasses
 import math
@@ -12,32 +12,32 @@ from lpac.radio.airtime import Wifi, airtime, carries
 from lpac.radio.checked import Checked, WifiReading
 from lpac.radio.pairs import LATE_S, Pair, blame
 
-# A mesh repeats what is lost until it is through, so that nothing should be missing. Where
-# more is, the radio is at fault; in multicast, more than chance makes of what each frame may lose.
+# A mesh repeats lost messages until they arrive, so a larger loss is the radio's fault; in
+# multicast it is one that exceeds the chance of lost frames.
 LEAST_DELIVERED = 0.95
 _CHANCE_DEVIATIONS = 3.0
-# Whoever gets a message late does not use it; and where so many are late, queues are filling.
+# Robots do not use late messages; and if so many are late, queues are filling.
 MOST_LATE = 0.01
-# Of the fifty of a check, one that is lost or late is chance.
+# Of a check's fifty messages, one lost or late is chance.
 _BY_CHANCE = 1
-# Of a channel's time, with gaps; above it delays grow quickly (docs/scaling.md).
+# Share of a channel's time, with gaps, above which delays grow quickly (docs/scaling.md).
 MOST_BUSY = 0.6
-# Times what the model says that a fleet's radios count; what is more is not this fleet's.
+# Largest ratio of the radios' counts to the model's that is attributed to this fleet.
 _MODEL_ERR = 1.5
-# As `lpac fleet doctor` has it.
+# As in `lpac fleet doctor`.
 _WEAK_DBM = -75.0
-WHAT_RUNS = "`lpac fleet status` tells which programs run; of simulated robots, `lpac sim` does"
+WHAT_RUNS = "`lpac fleet status` shows which programs run; for simulated robots, `lpac sim` does"
 
 
 class Room(NamedTuple):
-    """For how many robots in flight the model sees room on the channel, and what it was told.
+    """Number of robots in flight that the channel carries by the model, and the model's inputs.
 
-    `ground_share` is what the `robots` that spoke ask for with messages of `ground_bytes`, as they
-    were, and `flight_share` with `flight_bytes`. `rate_mbit_s` is assumed if `rate_told` is not,
-    and `multicast_rate_mbit_s`, at which an access point sends to all, always.
-    `busy_share` is what radios counted, without gaps, where the model has `model_busy_share`; None:
-    nobody told. The two shares and the room are scaled by that, as far as the model may err; what
-    is more others take, `others_share` with gaps, and the room is what these leave.
+    `ground_share` is the airtime of the `robots` that sent, with their messages of `ground_bytes`,
+    `flight_share` that with `flight_bytes`. `rate_mbit_s` is assumed unless `rate_told`;
+    `multicast_rate_mbit_s`, an access point's rate to all, always is. `busy_share` is the radios'
+    count, without gaps, for which the model has `model_busy_share`; None if unknown. The shares and
+    `carries` are scaled by this ratio, up to the model's error; the excess is `others_share`,
+    airtime of other networks with gaps, which reduces `carries`.
     """
 
     robots: int
@@ -56,7 +56,7 @@ class Room(NamedTuple):
 
 
 class RadioVerdict(NamedTuple):
-    """`problems` are the worst first, none if all is well; `room` is None if nobody spoke."""
+    """`problems` are sorted, worst first, empty if all is well; `room` is None without senders."""
 
     sentence: str
     problems: tuple[str, ...]
@@ -64,7 +64,7 @@ class RadioVerdict(NamedTuple):
 
 
 def obstacles(statuses: Mapping[str, RobotStatus]) -> tuple[str, ...]:
-    """Why robots, by name, do not yet say to each other what they will in a mission; what to do."""
+    """Reasons why robots, by name, do not yet send as in a mission, with remedies."""
 
     def those(is_so: Callable[[RobotStatus], bool], text: str) -> Iterator[str]:
         names = [name for name, status in statuses.items() if is_so(status)]
@@ -76,7 +76,7 @@ def obstacles(statuses: Mapping[str, RobotStatus]) -> tuple[str, ...]:
         known = [value for value in values if value is not None]
         if known:
             common = statistics.mode(known)
-            text = f"another {what} than most: who has another one is not listened to: {fix}"
+            text = f"another {what} than most, so their messages are ignored: {fix}"
             yield from those(lambda status: getattr(status, key) not in (None, common), text)
 
     return (
@@ -86,11 +86,11 @@ def obstacles(statuses: Mapping[str, RobotStatus]) -> tuple[str, ...]:
         ),
         *those(
             lambda status: status.origin is None,
-            "no mission origin, and so no position to speak of: first `lpac mission origin`",
+            "no mission origin, and so no position to send: first `lpac mission origin`",
         ),
         *those(
             lambda status: status.origin is not None and status.position_m is None,
-            "no position: wait until its GPS has one",
+            "no position: wait for its GPS",
         ),
         *others_than_most("bundle_id", "policy", "`lpac fleet deploy`"),
         *others_than_most("origin", "mission origin", "`lpac mission origin`"),
@@ -98,7 +98,7 @@ def obstacles(statuses: Mapping[str, RobotStatus]) -> tuple[str, ...]:
 
 
 def verdict(checked: Checked, pairs: Sequence[Pair]) -> RadioVerdict:
-    """Of what `pairs` found in the windows."""
+    """Judge the `pairs` found in the windows."""
     room = _room(checked)
     found = [
         *_silent(checked),
@@ -113,7 +113,7 @@ def _sentence(checked: Checked, room: Room | None, problems: Sequence[str]) -> s
     if problems:
         more = len(problems) - 1
         return problems[0] + (f"; and {more} more" if more else "")
-    # Where nobody speaks, that is a problem.
+    # Without senders there is a problem.
     assert room is not None
     of_which, beside = "", " beside a bulk stream" if checked.loaded else ""
     if room.robots > len(checked.robots):
@@ -126,9 +126,9 @@ def _sentence(checked: Checked, room: Room | None, problems: Sequence[str]) -> s
 
 
 def is_good(pair: Pair, expected_loss: float) -> bool:
-    """Whether the receiver hears enough of the sender, in time.
+    """Whether the receiver gets enough of the sender's messages, in time.
 
-    `expected_loss` is the share of messages that a radio as it should be loses for good.
+    `expected_loss` is the share of messages lost by a good radio.
     """
     missing, expected = pair.sent - pair.received, pair.sent * expected_loss
     chance = _CHANCE_DEVIATIONS * math.sqrt(expected * (1.0 - expected_loss))
@@ -136,7 +136,7 @@ def is_good(pair: Pair, expected_loss: float) -> bool:
     return enough and (pair.late <= _BY_CHANCE or pair.late_share <= MOST_LATE)
 
 
-# How bad it is, from 0 to 1, and what is wrong.
+# Badness, from 0 to 1, and the problem.
 _Found = tuple[float, str]
 
 
@@ -146,7 +146,7 @@ def _silent(checked: Checked) -> Iterator[_Found]:
         if window is None:
             yield 1.0, f"{name} is not heard here: {WHAT_RUNS}"
         elif window.sent < 1:
-            yield 1.0, f"{name} says nothing to the others: `lpac watch` tells what it lacks"
+            yield 1.0, f"{name} sends nothing to the others: `lpac watch` shows why"
 
 
 def _channel(room: Room | None) -> Iterator[_Found]:
@@ -154,12 +154,12 @@ def _channel(room: Room | None) -> Iterator[_Found]:
         return
     left = max(0.0, MOST_BUSY - room.others_share)
     text = (
-        f"by the model these {room.robots} robots ask in flight for {_percent(room.flight_share)} "
-        f"of the channel, of which they can use {_percent(left)}: it carries "
+        f"by the model these {room.robots} robots need {_percent(room.flight_share)} of the "
+        f"channel in flight, of which they can use {_percent(left)}: it carries "
         f"{room.carries or 'none'}"
     )
     if room.others_share > 0.0:
-        text += f"; others take {_percent(room.others_share)}: look for another channel"
+        text += f"; other networks take {_percent(room.others_share)}: look for another channel"
     yield 1.0 - room.carries / room.robots, text
 
 
@@ -174,7 +174,7 @@ def _unheard(checked: Checked, pairs: Sequence[Pair]) -> Iterator[_Found]:
             return ""
         return f" (its signal is weak: {signal_dbm:.0f} dBm)"
 
-    def told(its: Sequence[Pair], lost: str, late: str, name: str) -> _Found:
+    def problem(its: Sequence[Pair], lost: str, late: str, name: str) -> _Found:
         total = _sum(its)
         if total.sent - total.received >= total.late:
             text = lost.replace("SHARE", _percent(total.delivered))
@@ -185,14 +185,16 @@ def _unheard(checked: Checked, pairs: Sequence[Pair]) -> Iterator[_Found]:
 
     for name in found.receivers:
         its = [pair for pair in pairs if pair.receiver == name]
-        yield told(its, f"{name} hears SHARE of the others", f"all comes late to {name}", name)
+        yield problem(
+            its, f"{name} hears SHARE of the others", f"messages come late to {name}", name
+        )
     for name in found.senders:
         its = [pair for pair in pairs if pair.sender == name]
-        yield told(its, f"the others hear SHARE of {name}", f"{name}'s messages come late", name)
+        yield problem(its, f"the others hear SHARE of {name}", f"{name}'s messages come late", name)
     for sender, receiver in found.links:
         its = [pair for pair in pairs if (pair.sender, pair.receiver) == (sender, receiver)]
         late = f"{sender}'s messages come late to {receiver}"
-        yield told(its, f"{receiver} hears SHARE of {sender}", late, receiver)
+        yield problem(its, f"{receiver} hears SHARE of {sender}", late, receiver)
 
 
 def _sum(pairs: Sequence[Pair]) -> Pair:
@@ -210,16 +212,16 @@ def _room(checked: Checked) -> Room | None:
     if traffic is None:
         return None
     rates = [w.rate_mbit_s for w in checked.wifi.values() if w.rate_mbit_s]
-    # The slowest take the most time.
+    # Slow links take the most time.
     rate_mbit_s = statistics.harmonic_mean(rates) if rates else Wifi().data_rate_mbit_s
     wifi = Wifi(data_rate_mbit_s=rate_mbit_s, ground_wired=checked.ground_wired)
     ground = airtime(checked.transport, wifi, traffic)
     flight_bytes = max(traffic.message_bytes, checked.flight_bytes)
     flight = dataclasses.replace(traffic, message_bytes=flight_bytes)
-    # A radio that hears nobody does not count.
-    told = [w.busy_share for w in checked.wifi.values() if w.busy_share]
-    busy = statistics.median(told) if told and not checked.loaded else None
-    # Radios count no gaps.
+    # A radio without received frames does not count.
+    shares = [w.busy_share for w in checked.wifi.values() if w.busy_share]
+    busy = statistics.median(shares) if shares and not checked.loaded else None
+    # Radios do not count gaps.
     counted = 1.0 if busy is None else busy / ground.busy
     scale = min(counted, _MODEL_ERR)
     others = min(1.0, (counted - scale) * ground.total)
@@ -242,6 +244,6 @@ def _room(checked: Checked) -> Room | None:
 
 
 def _percent(share: float) -> str:
-    """Never 100 % of what is not all, nor 0 % of what is not nothing."""
+    """Percentage that is 100 % only for 1, and 0 % only for 0."""
     percent = min(99, max(1, math.floor(100.0 * share + 0.5))) if 0.0 < share < 1.0 else 100 * share
     return f"{percent:.0f} %"

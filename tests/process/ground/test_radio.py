@@ -104,7 +104,7 @@ def test_without_an_origin_the_operator_is_told_what_to_do_first(
     answer = ask(deaf, fleet)
     assert (answer.returncode, answer.stdout) == (1, "")
     assert answer.stderr.splitlines()[-1] == (
-        "lpac: radio: r0, r1, r2: no mission origin, and so no position to speak of: first "
+        "lpac: radio: r0, r1, r2: no mission origin, and so no position to send: first "
         "`lpac mission origin`"
     )
 

@@ -1,4 +1,4 @@
-"""What a field said in place of what the model assumes."""
+"""Calibration of the radio model with records."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -28,7 +28,7 @@ wifis = st.builds(
 def measured(
     wifi: Wifi, transport: Transport, robots: int, *, rates: bool = False, busy: bool = True
 ) -> RadioRecord:
-    """What the model says that such a field would say."""
+    """Records of a field as computed by the model."""
     size = MESSAGE_BYTES["float16"]
     traffic = Traffic(robots=robots, message_bytes=size)
     quality, sent = link_quality(transport, wifi, traffic), 10**7
@@ -104,7 +104,7 @@ def test_a_busy_channel_tells_nothing_but_the_radios_rates() -> None:
 
 
 def test_what_was_recorded_beside_a_bulk_stream_tells_nothing() -> None:
-    """Else what the stream pushes out would be taken for lost by noise."""
+    """Otherwise losses from the stream would count as noise."""
     quiet = [measured(FIELD, "multicast", 5, rates=True)]
     beside = [replace(each, loaded=True, busy_share=None, received=1) for each in quiet]
     assert kinds(beside) == {}
@@ -112,7 +112,7 @@ def test_what_was_recorded_beside_a_bulk_stream_tells_nothing() -> None:
 
 
 def test_a_channel_that_the_model_cannot_explain_tells_no_rate() -> None:
-    """Three robots can keep no channel so idle, at whatever rate."""
+    """Three robots cannot leave a channel so idle at any rate."""
     assert kinds([replace(measured(FIELD, "mesh", 3), busy_share=1e-6)]) == {}
 
 
@@ -142,13 +142,13 @@ def test_a_toml_file_has_what_it_has(tmp_path: Path) -> None:
 
 
 def test_records_of_no_radio_are_refused(tmp_path: Path) -> None:
-    """As of robots of `lpac sim`: what they hear would be taken for a perfect channel."""
+    """Robots of `lpac sim` receive as if from a perfect channel."""
     path = tmp_path / "loopback.jsonl"
     silent = measured(Wifi(frame_loss=0.0), "multicast", 3, busy=False)
     write_records(path, [silent, silent])
-    with pytest.raises(ConfigError, match="these records are not of a radio"):
+    with pytest.raises(ConfigError, match="no record has a radio's signal"):
         read_wifi(path)
-    # One robot's radio may not tell what others' do.
+    # One robot's radio may lack values that others have.
     write_records(path, [silent, replace(silent, signal_dbm=-60.0)])
     assert read_wifi(path).sources["frame_loss"] == Source(SourceKind.DELIVERED, 2)
 
@@ -171,7 +171,7 @@ def test_records_are_read(tmp_path: Path) -> None:
         ("wifi.toml", "ground_wired = 1", "ground_wired = 1: must be true or false"),
         ("wifi.toml", "frame_loss", "is not TOML"),
         ("wifi.toml", "#\udcff", "is not TOML"),
-        ("wifi.jsonl", "", "no record says anything of what the model assumes"),
+        ("wifi.jsonl", "", "no record has information about the model's values"),
         ("wifi.jsonl", "{}", "line 1: sender is missing"),
         ("wifi.yaml", "", "must be a .toml file of the model's values, or a .jsonl file"),
     ],

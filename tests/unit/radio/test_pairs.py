@@ -1,4 +1,4 @@
-"""Who heard how much of whom, and who is to blame."""
+"""Quality of links, and blame."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ SENT = round(HZ * SECONDS)
 
 
 def said(robot: int, heard: dict[int, Arrivals], *, after_s: float = 0.0) -> RobotStatus:
-    """By a robot that has said so much, and heard so much, after that time."""
+    """Status of a robot after a time, with counts of its own and received messages."""
     sent = round(HZ * after_s)
     return snapshots.on_ground(
         robot,
@@ -29,7 +29,7 @@ def said(robot: int, heard: dict[int, Arrivals], *, after_s: float = 0.0) -> Rob
 
 
 def two(before: Arrivals, after: Arrivals) -> Pair:
-    """What r1 hears of r0."""
+    """Reception of r0's messages by r1."""
     windows = {
         "r0": Window(said(0, {}), said(0, {}, after_s=SECONDS)),
         "r1": Window(said(1, {0: before}), said(1, {0: after}, after_s=SECONDS)),
@@ -69,7 +69,7 @@ def test_of_a_robot_that_is_not_heard_at_all_the_sender_tells() -> None:
 
 def test_what_was_lost_long_before_does_not_count() -> None:
     before = came(500, *[0.04] * 500)
-    # The first that came after a cut of minutes.
+    # The first arrivals after a gap of minutes.
     pair = two(before, came(300, *[0.04] * SENT, since=before))
     assert pair.sent <= SENT + 4
     assert pair.delivered >= 0.9
@@ -125,7 +125,7 @@ def test_who_is_to_blame() -> None:
     assert blame(links(*to("r3"), *from_("r4"), ("r1", "r2"))) == Blame(
         ("r3",), ("r4",), (("r1", "r2"),)
     )
-    # All is bad: each robot is told once.
+    # All links are bad: each robot is named once.
     assert blame(links(*ALL)) == Blame(tuple(NAMES), (), ())
     assert blame({("r0", "r1"): False, ("r1", "r0"): False}) == Blame(
         (), (), (("r0", "r1"), ("r1", "r0"))

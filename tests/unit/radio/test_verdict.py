@@ -1,4 +1,4 @@
-"""One sentence on a fleet's radio, and what is wrong with it."""
+"""One sentence on a fleet's radio, and its problems."""
 
 from dataclasses import replace
 from typing import Any
@@ -31,7 +31,7 @@ def checked(**changes: Any) -> Checked:
 
 
 def heard(**bad: tuple[int, int]) -> list[Pair]:
-    """All pairs, well but for "r1_r2": how much r2 received of r1, and of that how much late."""
+    """All pairs are good, except "r1_r2": r2's receptions from r1, and how many were late."""
     found = []
     for sender in NAMES:
         for receiver in NAMES:
@@ -62,7 +62,7 @@ def test_a_fleet_that_hears_itself_well() -> None:
     ("transport", "bytes_each", "received", "good"),
     [
         ("mesh", BYTES, SENT - 2, True), ("mesh", BYTES, SENT - 3, False),
-        # One frame for each, and two.
+        # One frame per message, and two.
         ("multicast", 900, SENT - 7, True), ("multicast", 900, SENT - 8, False),
         ("multicast", BYTES, SENT - 11, True), ("multicast", BYTES, SENT - 12, False),
     ],
@@ -99,7 +99,7 @@ def test_a_ground_in_the_wifi_itself_takes_more_of_it() -> None:
 
 def test_a_channel_that_is_busier_than_the_model_says_has_less_room() -> None:
     traffic = Traffic(robots=N, message_bytes=BYTES + 85, message_hz=2.5)
-    # As radios count it: without gaps.
+    # Radios count without gaps.
     model = airtime("mesh", Wifi(data_rate_mbit_s=220.0), traffic).busy
     same, busier = (
         verdict(checked(wifi=wifi(busy_share=share)), heard()) for share in (model, 1.5 * model)
@@ -123,11 +123,11 @@ def test_a_slow_rate_has_less_room() -> None:
 def test_a_channel_that_is_too_small_for_these_robots_is_a_problem() -> None:
     slow = verdict(checked(wifi=wifi(rate_mbit_s=6.0)), heard())
     assert slow.problems == (
-        "by the model these 10 robots ask in flight for 236 % of the channel, of which they can "
+        "by the model these 10 robots need 236 % of the channel in flight, of which they can "
         "use 60 %: it carries 5",
     )
     assert slow.sentence == slow.problems[0]
-    # Beside a stream, too, of which nothing is asked.
+    # Also beside a stream, which does not change it.
     assert verdict(checked(wifi=wifi(rate_mbit_s=6.0), loaded=True), heard()).problems
     grown = verdict(checked(flight_bytes=1e6), heard())
     assert grown.sentence.endswith("it carries 1")
@@ -137,7 +137,7 @@ def test_where_a_few_are_judged_the_others_still_take_airtime() -> None:
     few = checked(robots=NAMES[:2], windows={**checked().windows, "r9": spoken(9, sent=0)})
     assert {(pair.sender, pair.receiver) for pair in few.pairs()} == {("r0", "r1"), ("r1", "r0")}
     told = verdict(few, [pair for pair in heard() if {pair.sender, pair.receiver} <= {"r0", "r1"}])
-    # r9 is silent, which is no fault of those that are judged.
+    # r9 is silent, which is no fault of the judged robots.
     assert told.problems == ()
     assert told.sentence == (
         "carries 9 robots, of which r0, r1 were judged; by the model there is room for 7 more"
@@ -155,7 +155,7 @@ def test_where_a_few_are_judged_the_others_still_take_airtime() -> None:
         ({f"r3_{n}": (SENT, 25) for n in NAMES},
          "r3's messages come late: 50 % at 0.8 s or older, p99 1.3 s"),
         ({f"{n}_r3": (SENT, 25) for n in NAMES},
-         "all comes late to r3: 50 % at 0.8 s or older, p99 1.3 s"),
+         "messages come late to r3: 50 % at 0.8 s or older, p99 1.3 s"),
     ],
 )  # fmt: skip
 def test_what_is_wrong(bad: dict[str, tuple[int, int]], problem: str) -> None:
@@ -176,7 +176,7 @@ def test_the_worst_comes_first() -> None:
     told = verdict(checked(windows=windows), pairs)
     assert told.problems == (
         f"r4 is not heard here: {WHAT_RUNS}",
-        "r6 says nothing to the others: `lpac watch` tells what it lacks",
+        "r6 sends nothing to the others: `lpac watch` shows why",
         "r2 hears 20 % of r3",
         "r2 hears 90 % of r1",
     )
@@ -195,14 +195,14 @@ def test_a_weak_signal_is_told_of_who_is_heard_badly() -> None:
 def test_a_channel_that_others_take() -> None:
     (problem,) = verdict(checked(wifi=wifi(busy_share=0.31)), heard()).problems
     assert problem == (
-        "by the model these 10 robots ask in flight for 34 % of the channel, of which they can use "
-        "33 %: it carries 9; others take 27 %: look for another channel"
+        "by the model these 10 robots need 34 % of the channel in flight, of which they can use "
+        "33 %: it carries 9; other networks take 27 %: look for another channel"
     )
-    # Who takes less leaves room for some.
+    # Smaller foreign traffic leaves room for some.
     alone, beside = (verdict(checked(wifi=wifi(busy_share=busy)), heard()) for busy in (None, 0.25))
     assert alone.room is not None and beside.room is not None and beside.problems == ()
     assert N <= beside.room.carries < alone.room.carries
-    # A stream of the check's own is no stranger.
+    # The check's own stream is not foreign.
     loaded = verdict(checked(wifi=wifi(busy_share=0.8), loaded=True), heard())
     assert loaded.problems == ()
     assert loaded.sentence.startswith("carries 10 robots beside a bulk stream; by the model ")
