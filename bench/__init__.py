@@ -1,4 +1,4 @@
-"""Measurements of this project against torch and against the baselines (`make bench`)."""
+"""Benchmarks against torch and the baselines (`make bench`)."""
 
 from pathlib import Path
 

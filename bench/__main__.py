@@ -6,7 +6,7 @@ from importlib import import_module
 
 from bench import ROOT
 
-# One process is one robot, on one core; read by numpy when it is first imported.
+# One process is one robot on one core. numpy reads these when it is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

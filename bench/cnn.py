@@ -1,4 +1,4 @@
-"""How much of what the core can do the CNN gets out of it."""
+"""Efficiency of the CNN relative to the core's peak."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from bench.result import Table
 from bench.timing import interleaved, quartiles, with_quartiles
 from edge.core import F32
 
-# Large enough for the peak, small enough for the second-level cache of a small core.
+# Large enough for peak speed, small enough for a small core's second-level cache.
 _GEMM_SIZE = 512
 
 
@@ -23,7 +23,7 @@ def measure(
 ) -> dict[str, Any]:
     """Speed of the CNN, and the peak: the faster of two matrix products.
 
-    `same` is the CNN in torch, in which the operations are counted.
+    `same` is the CNN in torch, for counting operations.
     """
     with FlopCounterMode(display=False) as counted:
         same(torch.from_numpy(images))
@@ -41,7 +41,7 @@ def measure(
 
 
 def table(figures: dict[str, Any]) -> Table:
-    """Speed of the CNN beside that of matrix products."""
+    """Speed of the CNN and of matrix products."""
     speeds = {"CNN": figures["gflops"], **figures["peak_gflops"]}
     return Table(
         f"CNN, {100 * figures['share_of_peak']['median']:.0f} % of the peak",
@@ -51,7 +51,7 @@ def table(figures: dict[str, Any]) -> Table:
 
 
 def _gemms() -> dict[str, Callable[[], object]]:
-    """One large matrix product each by numpy's BLAS and by onnxruntime."""
+    """A large matrix product with numpy's BLAS and one with onnxruntime."""
     size = _GEMM_SIZE
     matrix = np.random.default_rng(1).random((size, size), np.float32)
     out = np.empty_like(matrix)

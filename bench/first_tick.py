@@ -1,6 +1,6 @@
 """`python -m bench.first_tick edge|torch`: a robot's policy process, for `footprint`.
 
-Each imports its own half alone, since what is measured is what a process loads.
+Each variant imports only its own packages, since loading is part of the measurement.
 """
 
 import json
@@ -16,14 +16,14 @@ from bench.usage import usage
 TICKED = "ticked\n"
 TICKS = 20
 
-# Mission frame, m; the neighbours are all in range.
+# Mission frame, m; all neighbours are in range.
 _POSITION_M = (16.0, 16.0, 0.0)
 _NEIGHBOURS_M = tuple((10.0 + i, 12.0, 0.0) for i in range(10))
 _ENV_SCALE = 16.0
 
 
 def run(tick: Callable[[], object]) -> None:
-    """Print TICKED after the first tick, and the memory, as JSON, after TICKS."""
+    """Print TICKED after the first tick, and the memory as JSON after TICKS."""
     tick()
     print(TICKED, end="", flush=True)
     for _ in range(TICKS - 1):
@@ -33,7 +33,7 @@ def run(tick: Callable[[], object]) -> None:
 
 
 def edge() -> Callable[[], object]:
-    """Load the bundle and hear ten neighbours; returns a tick."""
+    """Load the bundle and receive from ten neighbours; returns a tick."""
     from edge.core.aggregation import AggregatedMessage
     from edge.core.fleet_time import FleetTime
     from edge.core.frames import ModelScale

@@ -1,4 +1,4 @@
-"""Memory and start of a robot's policy process, against torch and torch_geometric's."""
+"""Memory and start-up time of a robot's policy process, against torch and torch_geometric."""
 
 import json
 import os
@@ -17,7 +17,7 @@ _NAMES = {EDGE: "lpac-edge", TORCH: "torch + PyG"}
 
 
 def measure(runs: int = 3) -> Result:
-    """Processes of their own, in turn; one of each before, so that files come from the cache."""
+    """Run separate processes in turn, after one warm-up each for the file cache."""
     processes: dict[str, list[dict[str, float]]] = {EDGE: [], TORCH: []}
     for run in range(runs + 1):
         for kind, results in processes.items():
@@ -58,14 +58,15 @@ def measure(runs: int = 3) -> Result:
             Target("time to first tick over theirs", ratios["first_tick_s"]["median"], 0.1, False),
         ],
         [
-            f"From the start of the process to its first tick done, and memory after {TICKS} ticks "
-            "with ten neighbours; warm file cache. The policy alone: no radio, no autopilot."
+            "Time from the start of the process to the end of its first tick, and memory after "
+            f"{TICKS} ticks with ten neighbours; warm file cache. The policy alone: no radio, no "
+            "autopilot."
         ],
     )
 
 
 def _run(kind: str) -> dict[str, float]:
-    """Seconds from the process's start to its first tick, and its memory in MB."""
+    """Time from the process's start to its first tick in s, and its memory in MB."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     start_s = perf_counter()
     with subprocess.Popen(

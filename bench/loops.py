@@ -1,7 +1,7 @@
-"""Robots in flight on this machine: how late their loops are, and what their programs take.
+"""Robots in flight on this machine: lateness of their loops, and resources of their programs.
 
-Ten robots, without keys and with them. The processes are those of a fleet: each robot's with its
-radio, autopilot and flight log; its watchdog, a process of its own, is not counted.
+Ten robots, without and with keys. Each robot's process has its radio, autopilot and flight log, as
+in a fleet; its watchdog, another process, is not counted.
 """
 
 import math
@@ -25,7 +25,7 @@ from lpac.sim.scenario import Scenario
 LOOPS = ("perception", "policy", "control")
 PLAIN, WITH_KEYS = "without keys", "with keys"
 
-# Once the mission has begun, all has been loaded that a flight needs.
+# Time after the mission's begin, when everything is loaded.
 _SETTLED_S = 3.0
 _LOOK_EVERY_S = 1.0
 
@@ -40,23 +40,23 @@ class _Taken(NamedTuple):
 
     @property
     def all_cpu_percent(self) -> float:
-        """All threads together."""
+        """Sum over all threads."""
         return sum(self.cpu_percent.values())
 
 
 class _Flight(NamedTuple):
-    """The robots' last statuses of a mission, and what their programs took in it."""
+    """The robots' last statuses of a mission, and their programs' resources."""
 
     statuses: list[LoggedStatus]
     taken: list[_Taken]
 
     def of(self, loop: str) -> list[LoopStatus]:
-        """Each robot's."""
+        """Status of a loop of each robot."""
         return [status.loops[loop] for status in self.statuses]
 
 
 def measure(robots: int = 10, mission_s: float = 60.0) -> Result:
-    """Two flights of so many robots."""
+    """Fly two flights of `robots` robots."""
     flights: dict[str, _Flight] = {}
     for keys in (PLAIN, WITH_KEYS):
         progress(f"loops: {robots} robots fly {keys}, about two minutes")
@@ -82,7 +82,7 @@ def measure(robots: int = 10, mission_s: float = 60.0) -> Result:
         [
             Table(
                 f"Lateness of {robots} robots' loops, ms: the median robot, and the worst",
-                ("", "loop", "p50", "p99", "max", "ticks left out"),
+                ("", "loop", "p50", "p99", "max", "missed ticks"),
                 [
                     (keys, loop, *_cells(flight.of(loop)))
                     for keys, flight in flights.items()
@@ -91,7 +91,7 @@ def measure(robots: int = 10, mission_s: float = 60.0) -> Result:
             ),
             *(
                 Table(
-                    f"What each of {robots} robots' programs takes in flight, {keys}",
+                    f"Resources of each of {robots} robots' programs in flight, {keys}",
                     ("", "median", "most"),
                     _taken_rows(flight.taken),
                 )
@@ -109,7 +109,7 @@ def measure(robots: int = 10, mission_s: float = 60.0) -> Result:
                 ("private memory, MB, that keys cost", with_keys[1] - plain[1], 8),
             )
         ],
-        ["Over the last minute of the mission. The vehicles and the operator share the cores."],
+        ["Over the last minute of the mission. Vehicles and operator share the cores."],
     )
 
 

@@ -1,4 +1,4 @@
-"""A moment of a flight: the input of all measurements of one robot's tick."""
+"""A moment of a flight: common input of the benches of one robot's tick."""
 
 from typing import NamedTuple
 
@@ -12,15 +12,15 @@ from edge.drivers.world_sensor import WorldSensor
 from edge.policy.family import Observation, Policy
 
 NEIGHBOURS = 10
-# Robots see the world on straight paths of so many views, and end within range of each other.
+# Robots fly straight paths of this many views, and end within range of each other.
 _VIEWS = 100
 
 
 class Moment(NamedTuple):
     """Inputs of the tick of one robot with ten neighbours, all in range.
 
-    Positions are in model units. `memory` is of what the robot has seen; `robot_map`
-    (world_size, world_size) is the same as one array. `payloads` are the neighbours' newest.
+    Positions are in model units. `memory` is the robot's; `robot_map` (world_size, world_size) is
+    the same as one array. `payloads` are the neighbours' newest.
     """
 
     position: F64
@@ -31,7 +31,7 @@ class Moment(NamedTuple):
 
 
 def moment_in_flight(policy: Policy) -> Moment:
-    """One robot and what its neighbours say: all have seen parts of a world."""
+    """A robot and its neighbours' payloads, after all have seen parts of a world."""
     perception = policy.manifest.perception
     assert perception
     rng = np.random.default_rng(1)
@@ -53,7 +53,7 @@ def moment_in_flight(policy: Policy) -> Moment:
 def _seen_on(
     path: F64, importance: F32, parameters: PerceptionParameters
 ) -> tuple[RobotMemory, F32]:
-    """Memory and map of a robot that flew along `path` (T, 2)."""
+    """Memory and map of a robot after a flight along `path` (T, 2)."""
     memory = RobotMemory(parameters)
     robot_map = RobotMap(parameters.world_size, parameters.unknown_importance)
     sensor = WorldSensor(importance, parameters.sensor_size)

@@ -1,7 +1,7 @@
-"""One robot's policy tick, from what it has seen and heard to its action and its own message.
+"""Time of one robot's policy tick, from memory and messages to its action and own message.
 
-Against the same in torch: eager with torch_geometric, and traced and frozen with one linear layer
-per tap. All take the same inputs on one thread each, and must agree before they are timed.
+Compared with torch: eager with torch_geometric, and traced and frozen with one linear layer per
+tap. All use the same inputs on one thread, and must agree before they are timed.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ Outputs = tuple[F32, F32]
 
 
 def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
-    """Whole tick, graph neural network alone, and the CNN's efficiency.
+    """Time the whole tick and the graph neural network, and measure the CNN's efficiency.
 
     Raises RuntimeError if the variants' outputs differ by more than TOLERANCE.
     """
@@ -75,16 +75,16 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
             ),
         ],
         [
-            "Tick: maps of the robot's surroundings, resize, CNN, aggregation of the neighbours' "
-            "messages, graph neural network, action, own message. The graph neural network alone: "
-            "from features and messages to the last layer and the own message. One thread each; "
-            "ratios are medians over rounds in which the variants take turns."
+            "Tick: maps of the surroundings, resize, CNN, aggregation of the neighbours' messages, "
+            "graph neural network, action, own message. Graph neural network alone: from features "
+            "and messages to the last layer and the own message. One thread each; ratios are "
+            "medians over rounds in which the variants alternate."
         ],
     )
 
 
 class EdgeRobot:
-    """Our tick at a moment of a flight."""
+    """lpac-edge's tick at a moment of a flight."""
 
     def __init__(self, policy: LpacPolicy, moment: Moment) -> None:
         assert policy.manifest.perception
@@ -112,7 +112,7 @@ class EdgeRobot:
         return features, self._hops.message(NEIGHBOURS)
 
     def images(self) -> F32:
-        """(1, channels, size, size): what the CNN sees."""
+        """Input of the CNN, (1, channels, size, size)."""
         return self._images.images(*self._observation()[:3]).copy()
 
     def _observation(self) -> Observation:
@@ -158,7 +158,7 @@ def _frozen(module: nn.Module, inputs: tuple[Tensor, ...]) -> Callable[..., Any]
 
 
 def _largest_difference(variants: Sequence[Callable[[], Outputs]]) -> float:
-    """Of any output of a variant from the first one's."""
+    """Largest difference of any output from the first variant's."""
     expected, *others = ([out.copy() for out in variant()] for variant in variants)
     return max(
         float(np.abs(a - b).max())

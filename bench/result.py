@@ -1,4 +1,4 @@
-"""Results of benches: how they are shown and kept."""
+"""Results of benches: printing and files."""
 
 import json
 import os
@@ -18,7 +18,7 @@ _PACKAGES = ("numpy", "onnxruntime", "torch", "torch-geometric")
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A figure that the project wants to reach."""
+    """A goal for a figure."""
 
     what: str
     measured: float
@@ -27,13 +27,13 @@ class Target:
 
     @property
     def met(self) -> bool:
-        """Whether it does."""
+        """Whether the figure reaches the goal."""
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of text under their columns."""
+    """Rows of text below their column headings."""
 
     title: str
     columns: tuple[str, ...]
@@ -42,7 +42,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One bench's result: `figures` for the file, tables for people, and both in `targets`."""
+    """Result of a bench: `figures` for the file, `tables` for people, `targets` for both."""
 
     name: str
     figures: dict[str, Any]
@@ -51,7 +51,7 @@ class Result:
     notes: list[str] = field(default_factory=list)
 
     def as_json(self) -> dict[str, Any]:
-        """The result as JSON values, as it is kept."""
+        """The content of the file."""
         return {
             "bench": self.name,
             "machine": _machine(),
@@ -61,7 +61,7 @@ class Result:
         }
 
     def show(self) -> None:
-        """Print the tables, and which targets are met."""
+        """Print tables and targets."""
         targets = [
             (
                 target.what,
@@ -86,7 +86,7 @@ class Result:
 
 
 def progress(text: str) -> None:
-    """Tell a waiting person what goes on."""
+    """Print a progress message."""
     typer.echo(text, err=True)
 
 

@@ -1,4 +1,4 @@
-"""The simulators of points with more and more robots at constant density."""
+"""The simulators of points with growing fleets at constant density."""
 
 import gc
 import math
@@ -20,21 +20,21 @@ from lpac.sim.points import SAMPLE_S, fly_points
 from lpac.sim.scenario import Scenario
 
 EXACT, BATCHED = "exact", "batched"
-# Of training: ten robots and ten features in one world.
+# As in training: ten robots and ten features in one world.
 _ROBOTS_PER_WORLD = 10
 # (robots, simulated seconds, flights)
 _FLIGHTS = ((10, 30.0, 3), (100, 6.0, 3), (1000, 2.0, 1))
-# Robots see more of the world the longer they fly, so all are weighed at the same age.
+# A robot's memory grows with time, so all are weighed at the same time.
 _MEMORY_AT_S = 2.0
 
 
 def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Result:
-    """Flights in processes of their own, one at a time; `flights` are robots, seconds, repeats."""
+    """Fly in separate processes, one at a time; `flights` are (robots, seconds, repeats)."""
     figures: dict[str, dict[str, Any]] = {}
     for robots, duration_s, repeats in flights:
         progress(f"scaling: {robots} robots, {duration_s:g} s, {repeats} times")
         runs: dict[str, list[dict[str, float]]] = {name: [] for name in (EXACT, BATCHED)}
-        # In turn, so that whatever else the machine does meets all of them.
+        # Alternate, so that other load on the machine affects all.
         for seed in range(repeats):
             for name, of_simulator in runs.items():
                 flight = in_own_process(_measure_flight, name, robots, duration_s, seed)
@@ -67,15 +67,15 @@ def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Result:
         list(_targets(figures)),
         [
             "One core each. Field scale; the world's area and its features grow with the robots. "
-            "Of several flights the median by processor time. Times leave out making the world, "
-            "but include the coverage cost J once a second; memory includes the world's raster, "
-            "but not the program."
+            "The median of several flights by processor time. Times exclude making the world and "
+            "include the coverage cost J once a second; memory includes the world's raster, not "
+            "the program."
         ],
     )
 
 
 def world_for(bundle: Bundle, robots: int) -> Bundle:
-    """The bundle for a world with room for so many robots."""
+    """The bundle with a world for `robots` robots."""
     perception = bundle.manifest.perception
     assert perception
     size = round(perception.world_size * math.sqrt(robots / _ROBOTS_PER_WORLD))
@@ -94,7 +94,7 @@ def _targets(figures: dict[str, dict[str, Any]]) -> Iterator[Target]:
 
 def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dict[str, float]:
     bundle = load_bundle(BUNDLE)
-    # What the libraries allocate once is not the robots'.
+    # Allocate the libraries' own memory first.
     small = Scenario(robots=2, duration_s=1.0, random_feature_count=1)
     _fly(name, small, world_for(bundle, 2), lambda _: None)
     gc.freeze()  # as `lpac sim` does
@@ -126,7 +126,7 @@ def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dic
 
 
 def _fly(name: str, scenario: Scenario, bundle: Bundle, note: Callable[[float], None]) -> None:
-    """Fly, and note the simulated time, from 0 to the flight's end."""
+    """Fly; call `note` with the simulated time, from 0 to the flight's end."""
     if name == EXACT:
         fly_points(scenario, bundle, lambda moment: note(moment.time_s))
         return

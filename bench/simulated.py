@@ -1,4 +1,4 @@
-"""Whole robots on one simulated clock: how much faster than real time they fly, on one core."""
+"""Speed of whole robots on one simulated clock, relative to real time, on one core."""
 
 import gc
 import tempfile
@@ -15,7 +15,7 @@ from lpac.sim.scenario import Scenario
 
 
 def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Result:
-    """Flights in processes of their own, one at a time: from the pads to the pads."""
+    """Fly in separate processes, one at a time, from takeoff to landing."""
     flights = []
     for run in range(runs):
         progress(f"simulated: {robots} robots, flight {run + 1} of {runs}")
@@ -50,14 +50,14 @@ def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Result:
         ],
         [
             f"`lpac sim --vehicle simulated` from takeoff to landing with {mission_s:g} s of "
-            "mission, without loading the program. Of several flights, all equal, the median."
+            "mission, without loading the program. Median of several equal flights."
         ],
     )
 
 
 def _fly(robots: int, mission_s: float) -> dict[str, float]:
     show("error")
-    gc.freeze()  # what is loaded stays
+    gc.freeze()  # loaded modules stay
     with tempfile.TemporaryDirectory() as folder:
         wall_s, cpu_s = perf_counter(), process_time()
         scenario = Scenario(robots=robots, seed=3, duration_s=mission_s)

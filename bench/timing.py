@@ -1,4 +1,4 @@
-"""Run what is timed: variants in turn in one process, or each run in a process of its own."""
+"""Timing: variants in turn in one process, or each run in its own process."""
 
 import gc
 from collections.abc import Callable, Mapping
@@ -39,13 +39,13 @@ def interleaved(
 
 
 def in_own_process(run: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
-    """Call `run` in a fresh process, so that no run finds another's memory; return its result."""
+    """Call `run` in a fresh process, without memory of other runs; return its result."""
     with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as process:
         return process.submit(run, *args, **kwargs).result()
 
 
 def quartiles(values: F64 | list[float]) -> dict[str, float]:
-    """The median, and the quartiles around it."""
+    """Median and quartiles."""
     q1, median, q3 = np.percentile(values, (25, 50, 75))
     return {"median": float(median), "q1": float(q1), "q3": float(q3)}
 

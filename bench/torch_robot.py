@@ -1,8 +1,8 @@
-"""The same policy in torch and torch_geometric, as a robot without this project would run it.
+"""The policy in torch and torch_geometric, as a robot without this project would run it.
 
-The network is LPAC's (arXiv 2401.04855) with the modules and names of its state dict. A robot in
-the air has no graph but its neighbours' aggregated messages, so each layer takes, for k = 1..K,
-y_k from what the neighbours sent for hop k, instead of from the hop before.
+The network is LPAC's (arXiv 2401.04855) with the modules and names of its state dict. A robot has
+no graph, only its neighbours' aggregated messages: for k = 1..K each layer takes y_k from their
+values for hop k instead of the hop before.
 """
 
 import math
@@ -28,8 +28,8 @@ Layer = Callable[[int, int, int], nn.Module]
 class PygLayer(TAGConv):  # type: ignore[misc]
     """torch_geometric's TAGConv on the star of a robot, node 0, and its neighbours, 1..n.
 
-    As TAGConv does, it propagates hop by hop and applies the taps at every node. It is spared the
-    normalisation by degree, which is in the messages and in `scale`.
+    Like TAGConv, it propagates hop by hop and applies the taps at every node. Normalisation by
+    degree is left out, since messages and `scale` contain it.
     """
 
     def __init__(self, inputs: int, outputs: int, hops: int) -> None:
@@ -57,7 +57,7 @@ class PygLayer(TAGConv):  # type: ignore[misc]
 
 
 class TapLayer(nn.Module):
-    """The same with a sum over the neighbours and one linear layer per tap."""
+    """The layer as a sum over the neighbours and one linear layer per tap."""
 
     def __init__(self, inputs: int, outputs: int, hops: int) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class TapLayer(nn.Module):
         self.bias = nn.Parameter(torch.empty(outputs))
 
     def forward(self, own: Tensor, held: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-        """As `PygLayer.forward`."""
+        """See `PygLayer.forward`."""
         hops = torch.cat([own, held.sum(0) * scale])
         out = self.bias
         for k, tap in enumerate(self.lins):
@@ -136,7 +136,7 @@ class TorchRobot:
         self, network: Callable[..., tuple[Tensor, Tensor]], perception: PerceptionParameters,
         image_size: int, robot_map: F32,
     ) -> None:  # fmt: skip
-        """`robot_map` (world_size, world_size) is what the robot has seen."""
+        """`robot_map` (world_size, world_size) is the robot's memory."""
         self._network = network
         self._perception = perception
         self._image_size = image_size
@@ -176,7 +176,7 @@ def exchange_inputs(payloads: Sequence[F32]) -> tuple[Tensor, Tensor]:
 
 
 def load_network(checkpoint: Path, layer: Layer) -> Network:
-    """The network of an LPAC state dict's file, on one thread."""
+    """Load the network of an LPAC state dict, on one thread."""
     torch.set_num_threads(1)
     return Network(torch.load(checkpoint, weights_only=True), layer)
 
@@ -196,7 +196,7 @@ def _cnn(state: Mapping[str, Tensor]) -> nn.Sequential:
 
 
 def _count(state: Mapping[str, Tensor], name: str) -> int:
-    """How many tensors have `name` with 0, 1, ... in it."""
+    """Number of tensors named `name` with 0, 1, .. in it."""
     count = 0
     while name.format(count) in state:
         count += 1

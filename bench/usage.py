@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class Usage(NamedTuple):
-    """At one time. `cpu_s` is by thread name, numbers left out; memory in MB, its own alone."""
+    """Usage until now. `cpu_s` is by thread name without numbers; memory in MB, of this process."""
 
     cpu_s: Mapping[str, float]
     threads: int
@@ -18,7 +18,7 @@ class Usage(NamedTuple):
 
 
 def usage(pid: int) -> Usage:
-    """Measure a process of this machine now. Raises OSError if it has ended."""
+    """Measure a process of this machine. Raises OSError if it has ended."""
     cpu_s: defaultdict[str, float] = defaultdict(float)
     tasks = list(Path(f"/proc/{pid}/task").iterdir())
     for task in tasks:

@@ -1,7 +1,7 @@
-"""How flights of the shipped policy usually end: what `lpac demo` and `lpac sim` compare with.
+"""Final costs of the shipped policy, with which `lpac demo` and `lpac sim` compare.
 
-Points as `lpac demo` flies them, over the clairvoyant's flight from the same starts; whole robots
-as `make fly` flies them, with their errors, over the best of Lloyd's runs.
+Points as in `lpac demo`, relative to the clairvoyant's flight from the same starts; whole robots as
+in `make fly`, with their errors, relative to the best of Lloyd's runs.
 """
 
 import json
@@ -20,7 +20,7 @@ from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.points import fly_points
 from lpac.sim.usual import POINTS, USUAL_JSON, WHOLE, Usual
 
-# Seeds of their own: no picture of the documentation shows one of these flights.
+# Reserved seeds: no figure of the documentation shows these flights.
 _FIRST_SEED = 1000
 _WHOLE_ROBOTS = (10, 5, 3, 1)
 
@@ -37,7 +37,7 @@ class _Ended(NamedTuple):
 
 
 def measure(points: int = 100, whole: int = 30) -> Result:
-    """So many worlds each: of ten points, and of each number of whole robots."""
+    """Fly `points` worlds with ten points, and `whole` with each number of whole robots."""
     seeds = range(_FIRST_SEED, _FIRST_SEED + max(points, whole))
     flights = [
         *(_Flight("whole", robots, seed) for robots in _WHOLE_ROBOTS for seed in seeds[:whole]),

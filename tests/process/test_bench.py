@@ -1,4 +1,4 @@
-"""The bench of processes runs, at its smallest size; how fast anything is plays no part."""
+"""Benches with processes run at their smallest size; speed is not tested."""
 
 from pathlib import Path
 

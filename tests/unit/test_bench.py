@@ -1,4 +1,4 @@
-"""Every bench runs, at its smallest size; how fast anything is plays no part."""
+"""Benches run at their smallest size; speed is not tested."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from edge.policy.bundle import Bundle
 
 
 def kept(report: Result, folder: Path) -> dict[str, Any]:
-    """The report as a reader of its file finds it, after it was shown."""
+    """Content of the report's file, after it was shown."""
     report.show()
     report.write(folder)
     result: dict[str, Any] = json.loads((folder / f"{report.name}.json").read_text())
