@@ -1,4 +1,4 @@
-"""Build the site, strictly: a warning, such as a broken link, is an error."""
+"""Builds the site; warnings, such as a broken link, are errors."""
 
 import argparse
 import logging
@@ -15,7 +15,7 @@ from handbook.pages import ROOT, PageError, write_pages
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m handbook", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("out/site"), help="its folder")
+    parser.add_argument("--out", type=Path, default=Path("out/site"), help="folder of the site")
     out: Path = parser.parse_args().out
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""The commands' reference, from the command itself."""
+"""Generates the reference of commands."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,26 +10,25 @@ from handbook.markdown import cell, code, table
 from lpac.cli.main import app
 
 _WIDE = 200
-# Defaults that are files of the repository are told without it.
+# Removed from defaults that are files of the repository.
 _ROOT = Path(__file__).resolve().parent.parent
 
 
 def page() -> str:
-    """Every command with its arguments and options."""
+    """Reference of every command with its arguments and options."""
     root: Any = typer.main.get_command(app)
     return "\n\n".join(
         [
             "# Commands",
-            "`lpac COMMAND --help` says the same in a terminal. A command whose packages are "
-            "missing says which extra has them. Every command ends with exit code 0 only if it "
-            "did what was asked.",
+            "`lpac COMMAND --help` shows the same in a terminal. If packages are missing, a "
+            "command names the extra to install. The exit code is 0 only if a command succeeded.",
             *_below(root, _context(root, None, "lpac")),
         ]
     )
 
 
 def names() -> list[str]:
-    """Every command as it is typed: "lpac mission origin"."""
+    """Every command in full, such as "lpac mission origin"."""
     root: Any = typer.main.get_command(app)
     return [context.command_path for _, context in _walk(root, _context(root, None, "lpac"))]
 
@@ -39,7 +38,7 @@ def _context(command: Any, parent: Any, name: str) -> Any:
 
 
 def _walk(group: Any, context: Any) -> Iterator[tuple[Any, Any]]:
-    """Each command below a group with its context, groups before what is in them."""
+    """Yield each command below a group with its context, groups first."""
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         its = _context(command, context, name)
@@ -64,4 +63,4 @@ def _below(root: Any, context: Any) -> Iterator[str]:
             if name != "--help"
         ]
         if rows:
-            yield table(("argument or option", "what it is"), rows)
+            yield table(("argument or option", "meaning"), rows)

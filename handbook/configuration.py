@@ -1,4 +1,4 @@
-"""Reference of each configuration file, key by key, from the dataclasses that read it."""
+"""Generates the reference of configuration files from their dataclasses."""
 
 import dataclasses
 import inspect
@@ -30,7 +30,7 @@ from lpac.train.lpac import LpacNetwork
 
 _ROOT = Path(__file__).resolve().parent.parent
 _REQUIRED = "must be given"
-# Each page with the dataclasses of its file; tests hold the pages to them.
+# Dataclasses of each page; tests check that they are complete.
 ROBOT = (RobotConfig,)
 FLEET = (FleetTable, RobotTable)
 GROUND = (ScriptTable, *STEPS_BEFORE.values(), *STEPS.values(), SavedSite, Wifi)
@@ -44,9 +44,8 @@ def robot() -> str:
     """robot.toml."""
     return _page(
         "robot.toml",
-        "A robot's configuration. `lpac fleet deploy` writes it from fleet.toml; by hand it is "
-        "needed only where one robot runs without a fleet. `lpac robot check --config robot.toml` "
-        "reads it and names what is wrong.",
+        "A robot's configuration. `lpac fleet deploy` writes it from fleet.toml; write it by hand "
+        "only for a robot without a fleet. `lpac robot check --config robot.toml` checks it.",
         _example("docs/robot.toml"),
         *_tables(RobotConfig, ""),
     )
@@ -56,9 +55,8 @@ def fleet() -> str:
     """fleet.toml."""
     return _page(
         "fleet.toml",
-        "The fleet as the workstation sees it: which robots there are, how to reach them, and who "
-        "flies where. `[robot]` and `[robots.NAME.robot]` hold the tables and keys of "
-        "[robot.toml](robot-toml.md).",
+        "The fleet as configured on the workstation: its robots, their addresses and places. "
+        "`[robot]` and `[robots.NAME.robot]` hold tables and keys of [robot.toml](robot-toml.md).",
         _example("docs/fleet.toml"),
         *_tables(FleetTable, ""),
         *_tables(RobotTable, "robots.NAME"),
@@ -66,7 +64,7 @@ def fleet() -> str:
 
 
 def ground() -> str:
-    """Scripts, sites and radios."""
+    """Files of scripts, sites and radios."""
     steps = [
         part
         for where, kinds in (("before", STEPS_BEFORE), ("steps", STEPS))
@@ -92,13 +90,13 @@ def training() -> str:
     """Files of `lpac train` and `lpac export`."""
     return _page(
         "Training",
-        "What `lpac train CONFIG.toml` reads. Lengths are in model units, times in seconds. "
+        "Configuration of `lpac train CONFIG.toml`. Lengths are in model units, times in seconds. "
         "`examples/` has four such files; this is `examples/field.toml`.",
         _example("examples/field.toml"),
         *_tables(TrainingConfig, ""),
         *_tables(LpacNetwork, "network", '[network], family = "lpac"'),
-        "## Parameters of a checkpoint\n\nWhat `lpac export --params` reads, where it is not "
-        "CoverageControl's own file. `[perception]` and `[training]` are as above.",
+        "## Parameters of a checkpoint\n\nFile of `lpac export --params`, unless it is "
+        "CoverageControl's own. `[perception]` and `[training]` are as above.",
         _example("policies/lpac_l2_k3_n10_512.toml"),
         *_tables(PolicyParameters, "", "The file", but=("perception", "training")),
     )
@@ -108,9 +106,9 @@ def ablation() -> str:
     """Files of `lpac ablate`."""
     return _page(
         "Ablation",
-        "What `lpac ablate ABLATION.toml` reads. `train` holds keys of "
-        "[a training](training.md) that are merged into the base, `fly` those of "
-        "[a study's condition](study.md).",
+        "Configuration of `lpac ablate ABLATION.toml`. `train` holds keys of [a "
+        "training](training.md) that are merged into the base's, `fly` those of [a study's "
+        "condition](study.md).",
         _example("examples/ablation.toml"),
         *_tables(AblationConfig, ""),
     )
@@ -120,15 +118,15 @@ def study() -> str:
     """Files of `lpac study`."""
     return _page(
         "A study",
-        "What `lpac study STUDY.toml` reads; `lpac/paper/studies` has the paper's experiments in "
-        "the same form.",
+        "Configuration of `lpac study STUDY.toml`; `lpac/paper/studies` has the paper's "
+        "experiments in this form.",
         _example("examples/study.toml"),
         *_tables(StudyFile, ""),
         "## Keys of `[scenario]` and of each of `[[conditions]]`",
         *_tables(ConditionKeys, "", "Of the condition"),
         *_tables(Scenario, "", "Of its flights", hidden=DRAWN),
         "## Keys of a drill",
-        "A file with `faults` flies these instead of worlds: [the drill](../drill.md).",
+        "A file with `faults` is a [drill](../drill.md): it flies faults instead of worlds.",
         _example("examples/drill.toml"),
         *_tables(Drill, ""),
     )
@@ -146,7 +144,7 @@ def manifest() -> str:
 
 
 def keys(cls: type[Any]) -> Iterator[str]:
-    """All keys of a dataclass and of those within it."""
+    """All keys of a dataclass, and of dataclasses in its fields."""
     for name, hint in _hints(cls).items():
         yield name
         within = _within(hint)
@@ -167,9 +165,9 @@ def _tables(
     cls: type[Any], path: str, title: str | None = None, but: tuple[str, ...] = (),
     hidden: tuple[str, ...] = (),
 ) -> Iterator[str]:  # fmt: skip
-    """A section for the dataclass at `path` of the file, and one for each within it.
+    """Yield a section for the dataclass at `path` of the file, and one for each below it.
 
-    Those within `but` have none; a file does not have the `hidden` keys.
+    Fields in `but` get no section; `hidden` ones are not keys of the file.
     """
     yield f"### {title or (f'[{path}]' if path else 'The top of the file')}"
     yield _about(cls)
@@ -186,13 +184,13 @@ def _tables(
         about = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, str)]
         rows.append((f"`{field.name}`", cell("; ".join([_kind(hint), *about])), _default(field)))
     if rows:
-        yield table(("key", "value", "if it is left out"), rows)
+        yield table(("key", "value", "default"), rows)
     for within, its, heading in below:
         yield from _tables(within, its, heading)
 
 
 def _about(cls: type[Any]) -> str:
-    """A dataclass's docstring, but for what it raises: that is for programs."""
+    """A dataclass's docstring without its exceptions, which do not concern users."""
     paragraphs = (inspect.getdoc(cls) or "").split("\n\n")
     return "\n\n".join(each for each in paragraphs if not each.startswith("Raises "))
 
@@ -203,7 +201,7 @@ def _hints(cls: type[Any]) -> dict[str, Any]:
 
 
 def _within(hint: Any) -> type[Any] | None:
-    """The dataclass that a key's table, or each of its tables, is read into."""
+    """The dataclass of a key's table or list of tables."""
     if dataclasses.is_dataclass(hint):
         return typing.cast(type[Any], hint)
     if typing.get_origin(hint) in (Annotated, tuple, types.UnionType, typing.Union):

@@ -1,4 +1,4 @@
-"""The Python reference: what notebooks use, and what packages of others implement."""
+"""Generates the Python reference: the API, and interfaces for other packages."""
 
 import ast
 import dataclasses
@@ -17,7 +17,7 @@ from lpac import api
 
 _LINE = 88
 _ROOT = Path(__file__).resolve().parent.parent
-# What a package imports, by what it is for: each module, and the names that are taken from it.
+# Names for other packages, by purpose and module.
 _INTERFACES = {
     "A sensor": {
         "edge.core.ports": "SensorDriver SensorSetting SensorOver Sensor Camera Look",
@@ -74,7 +74,7 @@ _INTERFACES = {
 
 
 def names() -> set[tuple[str, str]]:
-    """All that the page of interfaces has: each name, after the module that it is imported from."""
+    """Module and name of everything on the page of interfaces."""
     return {
         (module, name)
         for taken in _INTERFACES.values()
@@ -84,7 +84,7 @@ def names() -> set[tuple[str, str]]:
 
 
 def python_api() -> str:
-    """`lpac.api`, all of it."""
+    """Reference of `lpac.api`."""
     return "\n\n".join(
         [
             "# Python: reference",
@@ -96,13 +96,13 @@ def python_api() -> str:
 
 
 def page() -> str:
-    """Interfaces of drivers and policy families."""
+    """Reference of interfaces of drivers and policy families."""
     return "\n\n".join(
         [
             "# Interfaces",
-            "What a package of yours implements, what it is given, and what else it imports. "
-            "[Extending](../extending.md) builds one from beginning to end; bundles, flights and "
-            "worlds are in [Python: reference](api.md).",
+            "Interfaces for a package of yours: what it implements, its arguments, and other "
+            "imports. [Extending](../extending.md) builds one from beginning to end; bundles, "
+            "flights and worlds are in [Python: reference](api.md).",
             "Like those, the names here change only with a new minor version, and "
             "[the changelog](../../CHANGELOG.md) says how.",
             *(
@@ -124,7 +124,7 @@ def _each(taken: Mapping[str, str]) -> Iterator[str]:
 
 
 def _described(thing: object, name: str, heading: str, imported: str = "") -> str:
-    """A name, `imported` from a module: its call or its fields, and what it says of itself."""
+    """Describe a name, `imported` from a module: signature or fields, and docstring."""
     parts = [f"{heading} {name}"]
     if imported:
         parts.append(f"`from {imported} import {name}`")
@@ -143,13 +143,13 @@ def _described(thing: object, name: str, heading: str, imported: str = "") -> st
     elif imported:
         parts += _assignment(import_module(imported), name)
     else:
-        # A path of the repository is told without the folder that it lies in.
+        # Make paths in the repository relative.
         parts.append(code(repr(thing).replace(f"{_ROOT}/", "")))
     return "\n\n".join(part for part in parts if part)
 
 
 def _assignment(module: types.ModuleType, name: str) -> list[str]:
-    """A type or a number as the source has it, and the comment above it."""
+    """Source of an assignment, and the comment above it."""
     source = inspect.getsource(module)
     [found] = (
         line
@@ -157,24 +157,24 @@ def _assignment(module: types.ModuleType, name: str) -> list[str]:
         if (isinstance(line, ast.Assign) and ast.unparse(line.targets[0]) == name)
         or (isinstance(line, ast.AnnAssign) and ast.unparse(line.target) == name)
     )
-    said = " ".join(line.removeprefix("# ") for line in _comment(found, source))
-    return [f"```python\n{ast.get_source_segment(source, found)}\n```", said]
+    comment = " ".join(line.removeprefix("# ") for line in _comment(found, source))
+    return [f"```python\n{ast.get_source_segment(source, found)}\n```", comment]
 
 
 def _constants(module: types.ModuleType) -> str:
-    """Its numbers and texts, as the source has them."""
+    """Source of a module's constants."""
     source = inspect.getsource(module)
     found = []
     for line in ast.parse(source).body:
         if isinstance(line, ast.Assign) and not ast.unparse(line.targets[0]).startswith("_"):
-            with suppress(ValueError):  # what is computed is no constant
+            with suppress(ValueError):  # not a literal
                 ast.literal_eval(line.value)
                 found.append(ast.get_source_segment(source, line) or "")
     return "\n".join(["```python", *found, "```"]) if found else ""
 
 
 def _comment(line: ast.stmt, source: str) -> list[str]:
-    """The lines of the comment that stands above a line of the source, from their # on."""
+    """Lines of the comment above a line of the source."""
     lines = [each.strip() for each in source.splitlines()[: line.lineno - 1]]
     first = len(lines)
     while first and lines[first - 1].startswith("# "):
@@ -183,7 +183,7 @@ def _comment(line: ast.stmt, source: str) -> list[str]:
 
 
 def _methods(cls: type) -> list[tuple[str, Any]]:
-    """Members that a class defines itself and documents; of a driver its call, too."""
+    """Documented members that a class defines itself, including `__call__`."""
     return [
         (name, member)
         for name, member in vars(cls).items()
@@ -194,7 +194,7 @@ def _methods(cls: type) -> list[tuple[str, Any]]:
 
 
 def _class(cls: type) -> str:
-    """Its fields or values, or how it is made; nothing for a protocol."""
+    """Fields, values, or constructor of a class; "" for a protocol."""
     if issubclass(cls, Enum):
         return "```python\n" + "\n".join(f"{it.name} = {it.value!r}" for it in cls) + "\n```"
     definition = _definition(cls)
@@ -231,9 +231,9 @@ def _function(function: Any, *, bound: bool = False) -> str:
 def _call(
     definition: ast.FunctionDef | ast.AsyncFunctionDef, name: str, *, bound: bool = False
 ) -> str:
-    """The call as the source has it; one argument on a line where it is long.
+    """Signature as in the source, with one argument per line if it is long.
 
-    Who calls what is `bound` does not give the first.
+    `bound` drops the first argument.
     """
     arguments = _arguments(definition.args)[1 if bound else 0 :]
     returns = f" -> {ast.unparse(definition.returns)}" if definition.returns else ""
@@ -246,13 +246,13 @@ def _call(
 def _arguments(arguments: ast.arguments) -> list[str]:
     own = [*arguments.posonlyargs, *arguments.args]
     defaults = [*[None] * (len(own) - len(arguments.defaults)), *arguments.defaults]
-    said = [_argument(*each) for each in zip(own, defaults, strict=True)]
+    shown = [_argument(*each) for each in zip(own, defaults, strict=True)]
     if arguments.vararg:
-        said.append(f"*{ast.unparse(arguments.vararg)}")
+        shown.append(f"*{ast.unparse(arguments.vararg)}")
     elif arguments.kwonlyargs:
-        said.append("*")
-    said += map(_argument, arguments.kwonlyargs, arguments.kw_defaults)
-    return said + ([f"**{ast.unparse(arguments.kwarg)}"] if arguments.kwarg else [])
+        shown.append("*")
+    shown += map(_argument, arguments.kwonlyargs, arguments.kw_defaults)
+    return shown + ([f"**{ast.unparse(arguments.kwarg)}"] if arguments.kwarg else [])
 
 
 def _argument(argument: ast.arg, default: ast.expr | None) -> str:

@@ -1,19 +1,19 @@
-"""Markdown out of values."""
+"""Formats values as Markdown."""
 
 from collections.abc import Iterable, Sequence
 
 
 def cell(text: str) -> str:
-    """A text as it may stand in a cell of a table."""
+    """Escape text for a cell of a table."""
     return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
 
 
 def code(text: str) -> str:
-    """The same as code, in which nothing has a meaning."""
+    """Format text as code."""
     return f"`{' '.join(text.split())}`"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of cells that are Markdown already."""
+    """Format a table of Markdown cells."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

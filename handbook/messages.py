@@ -1,4 +1,4 @@
-"""Reference of radio and logs, from the table of topics and the messages."""
+"""Generates the reference of messages, topics and logs."""
 
 import dataclasses
 import inspect
@@ -48,14 +48,14 @@ _LOGS = {"A robot's log": flight_log, "The ground's log": record}
 
 
 def page() -> str:
-    """Topics, messages, layouts, codes and logs."""
+    """Reference of topics, messages, layouts, codes and logs."""
     return "\n\n".join(
         [
             "# Messages and topics",
             "## Topics",
             _rest(topics),
             table(
-                ("key below `lpac/FLEET/`", "says", "how often", "most bytes", "priority",
+                ("key below `lpac/FLEET/`", "content", "rate", "most bytes", "priority",
                  "in the flight log"),
                 [
                     (
@@ -69,15 +69,15 @@ def page() -> str:
                     for topic in topics.TOPICS
                 ],
             ),
-            "Beacon and policy's message are binary. All others are JSON with the fields below; "
-            "a message travels in one signed envelope. A field with a default may be left out, and "
-            "a field that a program does not know is passed over.",
+            "Beacon and policy's message are binary. All others are JSON with the fields below, "
+            "each message in one signed envelope. Fields with a default are optional, and unknown "
+            "fields are ignored.",
             "## Messages",
             *(part for message in MESSAGES for part in _message(message)),
             "## Layouts in bytes",
             *(f"### {title}\n\n{_rest(module)}" for title, module in _LAYOUTS.items()),
             "## Codes",
-            "What machines decide by; the text beside a code is for people and may change.",
+            "Codes are for machines; the text beside a code is for people and may change.",
             *(part for codes in CODES for part in _codes(codes)),
             "## Logs",
             *(f"### {title}\n\n{_rest(module)}" for title, module in _LOGS.items()),
@@ -86,7 +86,7 @@ def page() -> str:
 
 
 def _rest(module: types.ModuleType) -> str:
-    """A module's docstring without its first line, which is the module's title."""
+    """A module's docstring without its first line."""
     return (inspect.getdoc(module) or "").partition("\n")[2].strip()
 
 
@@ -103,7 +103,7 @@ def _message(cls: type[Any]) -> list[str]:
     return [
         f"### {cls.__name__}",
         inspect.getdoc(cls) or "",
-        table(("field", "type", "bounds", "always there"), rows),
+        table(("field", "type", "bounds", "required"), rows),
     ]
 
 
@@ -116,7 +116,7 @@ def _codes(codes: type[StrEnum]) -> list[str]:
 
 
 def _kind(hint: Any) -> tuple[str, str]:
-    """A field's type in words, and its bounds."""
+    """A field's type as text, and its bounds."""
     metadata = getattr(hint, "__metadata__", ())
     if metadata:
         kind, within = _kind(hint.__origin__)

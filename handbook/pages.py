@@ -1,7 +1,7 @@
-"""Which pages the site has, and where a link of the repository leads on it.
+"""Pages of the site, and the targets of the repository's links on it.
 
-Pages are written to be read in the repository: their links are paths there. On the site `docs/` is
-the root, README.md the front page, and a file of code that a page links to is a page of its own.
+Pages are written for the repository, with paths as links. On the site `docs/` is the root,
+README.md the front page, and each linked file of code gets a page of its own.
 """
 
 import json
@@ -14,7 +14,7 @@ from pathlib import Path
 from handbook import commands, configuration, interfaces, messages
 
 ROOT = Path(__file__).resolve().parent.parent
-# Pages that are not in docs/. What they and docs/ link to comes with them.
+# Pages outside of docs/. Files that are linked from pages are added.
 _OTHERS = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "policies/README.md", "tests/README.md")
 _GENERATED: dict[str, Callable[[], str]] = {
     "docs/reference/commands.md": commands.page,
@@ -32,33 +32,33 @@ _GENERATED: dict[str, Callable[[], str]] = {
 _CODE_BLOCK = re.compile(r"^(`{3,}|~{3,}).*?^\1", re.S | re.M)
 _LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\])\(([^()\s]+)\)")
 _STYLE = "site.css"
-# What a browser shows or saves as it is.
+# Copied without change.
 _COPIED = (".png", ".svg", ".html")
-# Code is read after a link, and would bury the pages in what a search finds.
+# Code would bury the pages in search results.
 _UNSEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"
 
 
 class PageError(ValueError):
-    """A link of a page leads nowhere; the text names both."""
+    """A page has a broken link; the text names both."""
 
 
 def generated() -> list[str]:
-    """Paths of the pages that are made from the code, as the repository's pages link to them."""
+    """Paths of the generated pages, as in links of the repository."""
     return list(_GENERATED)
 
 
 def hand_written() -> list[str]:
-    """Paths in the repository of the pages that people write."""
+    """Paths of the hand-written pages."""
     return [*_OTHERS, *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
 
 
 def links(text: str) -> Iterator[str]:
-    """Where a page's links and pictures lead, as they stand there; none of its code blocks."""
+    """Yield the targets of a page's links and pictures, without code blocks."""
     yield from (match[2] for match in _LINK.finditer(_CODE_BLOCK.sub("", text)))
 
 
 def target(link: str, page: str) -> str | None:
-    """The path in the repository that a page's link leads to; None for another site, or itself."""
+    """The repository path of a page's link; None for other sites and links within the page."""
     path = link.partition("#")[0]
     if not path or re.match(r"[a-z]+:", path):
         return None
@@ -66,7 +66,7 @@ def target(link: str, page: str) -> str | None:
 
 
 def place(path: str) -> str:
-    """Where a file of the repository is in the site's sources."""
+    """Path of a repository's file in the site's sources."""
     folder, name = posixpath.split(path)
     if path.endswith(".md"):
         name = "index.md" if name == "README.md" else name
@@ -76,7 +76,7 @@ def place(path: str) -> str:
 
 
 def write_pages(folder: Path) -> None:
-    """Write the site's sources. Raises PageError for a link that leads nowhere."""
+    """Write the site's sources. Raises PageError for a broken link."""
     shutil.copyfile(ROOT / "handbook" / _STYLE, folder / _STYLE)
     waiting = [*hand_written(), *_GENERATED]
     known = set(waiting)
@@ -101,7 +101,7 @@ def write_pages(folder: Path) -> None:
 
 
 def page_text(path: str) -> str:
-    """A page as it is written for the repository; a page that shows another file, or a folder."""
+    """Markdown of a page, of another file, or of a folder's list of files."""
     if path in _GENERATED:
         return _GENERATED[path]()
     if (ROOT / path).is_dir():
@@ -117,7 +117,7 @@ def page_text(path: str) -> str:
 
 
 def _notebook(text: str) -> str:
-    """Its words and its code; what comes out is there once somebody has run it."""
+    """Text and code of a notebook, without outputs."""
     cells = ((cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"])
     return "\n\n".join(
         source if kind == "markdown" else f"```python\n{source}\n```" for kind, source in cells

@@ -1,4 +1,4 @@
-"""`python -m handbook.scaling`: docs/scaling.png, and the tables of docs/scaling.md to print."""
+"""`python -m handbook.scaling`: draw docs/scaling.png, print the tables of docs/scaling.md."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ MOST = 0.6
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """How a fleet's messages travel."""
+    """Transport of a fleet's messages."""
 
     name: str
     transport: Transport
@@ -43,7 +43,7 @@ TOPOLOGIES = (
 
 
 def tables() -> dict[str, str]:
-    """The tables of docs/scaling.md, as Markdown, by what they are about."""
+    """The tables of docs/scaling.md as Markdown, by topic."""
     robots = [str(n) for n in FLEETS]
     return {
         "airtime": _table(
@@ -58,7 +58,7 @@ def tables() -> dict[str, str]:
 
 
 def draw(path: Path) -> None:
-    """Airtime over the number of robots. Raises OSError."""
+    """Draw airtime over the number of robots. Raises OSError."""
     with style.figure(style.WIDTH_IN / 2, 3.0) as figure:
         axes = figure.subplots()
         robots = sorted({round(10 ** (step / 20)) for step in range(6, 41)})
@@ -79,7 +79,7 @@ def draw(path: Path) -> None:
 
 
 def _of_fleets(text: Callable[[Topology, int, PayloadType], str]) -> list[tuple[str, ...]]:
-    """A row for each topology, and in it a cell for each size of a fleet."""
+    """A row per topology with a cell per size of a fleet."""
     return [
         (topology.name, *(_both(partial(text, topology, n)) for n in FLEETS))
         for topology in TOPOLOGIES
@@ -87,7 +87,7 @@ def _of_fleets(text: Callable[[Topology, int, PayloadType], str]) -> list[tuple[
 
 
 def _both(text: Callable[[PayloadType], str]) -> str:
-    """Of each payload type, or once if they are the same."""
+    """Text for each payload type, or once if equal."""
     texts = [text(payload) for payload in PAYLOADS]
     return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
 

@@ -1,6 +1,6 @@
 """`python -m handbook.scaling_cost FOLDER...`: coverage cost over team size, by transport.
 
-Of evaluations with `--transport`: a table of docs/scaling.md to print.
+Prints a table of docs/scaling.md from evaluations with `--transport`.
 """
 
 import json
@@ -17,7 +17,7 @@ IDEAL = "nothing lost or late"
 class FlownTeam:
     """Result of a team: the first method's cost over the clairvoyant's.
 
-    `loss` and `delay_s` are what its messages suffered, by the model.
+    `loss` and `delay_s` are those of its messages, by the model.
     """
 
     robots: int
@@ -28,10 +28,10 @@ class FlownTeam:
     delay_s: float
 
 
-def teams_of(told: Mapping[str, Any]) -> list[FlownTeam]:
-    """Of an evaluation.json: one of each condition that is no other than by its radio."""
+def teams_of(evaluation: Mapping[str, Any]) -> list[FlownTeam]:
+    """Teams in an evaluation.json; conditions differ only in their radio."""
     teams = []
-    for condition in told["conditions"]:
+    for condition in evaluation["conditions"]:
         scenario, [result, *_] = condition["scenario"], condition["results"]
         radio, link = scenario["radio"], scenario["link"]
         cost, *_ = result["over_clairvoyant"]["ratio_of_means"]
@@ -39,7 +39,7 @@ def teams_of(told: Mapping[str, Any]) -> list[FlownTeam]:
             FlownTeam(
                 robots=scenario["robots"],
                 radio=radio["transport"] if radio else IDEAL,
-                worlds=told["worlds"],
+                worlds=evaluation["worlds"],
                 cost=cost,
                 loss=link["loss"],
                 delay_s=link["delay_s"],
@@ -49,7 +49,7 @@ def teams_of(told: Mapping[str, Any]) -> list[FlownTeam]:
 
 
 def table(teams: Sequence[FlownTeam]) -> str:
-    """As Markdown: times the clairvoyant; and what was lost, and the mean delay."""
+    """The costs over the clairvoyant's, losses and mean delays, as Markdown."""
     sizes = sorted({team.robots for team in teams})
     worlds = {team.robots: str(team.worlds) for team in teams}
     lines = [
@@ -64,7 +64,7 @@ def table(teams: Sequence[FlownTeam]) -> str:
 
 
 def _by_radio(teams: Iterable[FlownTeam]) -> dict[str, list[FlownTeam]]:
-    """Each by team size."""
+    """Teams by radio, sorted by size."""
     found: dict[str, list[FlownTeam]] = {}
     for team in sorted(teams, key=lambda team: team.robots):
         found.setdefault(team.radio, []).append(team)
@@ -82,10 +82,10 @@ def main(folders: Sequence[str]) -> None:
     if not folders:
         sys.exit("which folders? python -m handbook.scaling_cost FOLDER...")
     try:
-        told = [json.loads((Path(f) / "evaluation.json").read_text()) for f in folders]
+        evaluation = [json.loads((Path(f) / "evaluation.json").read_text()) for f in folders]
     except FileNotFoundError as error:
-        sys.exit(f"{error.filename}: there is none; `lpac evaluate --transport --out` writes it")
-    sys.stdout.write(table([team for one in told for team in teams_of(one)]) + "\n")
+        sys.exit(f"{error.filename}: no such file; `lpac evaluate --transport --out` writes it")
+    sys.stdout.write(table([team for one in evaluation for team in teams_of(one)]) + "\n")
 
 
 if __name__ == "__main__":

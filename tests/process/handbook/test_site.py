@@ -9,7 +9,7 @@ from tests.conftest import ROOT
 
 
 class _Loaded(HTMLParser):
-    """What a page loads when it is opened."""
+    """Resources that a page loads when it is opened."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -21,7 +21,7 @@ class _Loaded(HTMLParser):
 
 
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
-    """Strictly: a broken link or anchor, or a page that no navigation has, would end it."""
+    """In strict mode: a broken link or anchor, or a page without navigation, fails."""
     out = tmp_path / "site"
     built = subprocess.run(
         [sys.executable, "-m", "handbook", "--out", str(out)],

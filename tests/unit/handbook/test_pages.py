@@ -1,4 +1,4 @@
-"""The documentation's pages: their links, and a reference that leaves nothing out."""
+"""The documentation's pages: links, and a complete reference."""
 
 import ast
 import dataclasses
@@ -27,7 +27,7 @@ _EXAMPLES = sorted((ROOT / "examples").rglob("*.py"))
 
 
 def anchors(page: str) -> set[str]:
-    """What links can lead to on a page, by GitHub's rule, which the site's is set to."""
+    """Targets of links on a page, by GitHub's rule, which the site uses, too."""
     text = _CODE_BLOCK.sub("", pages.page_text(page))
     return {
         re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
@@ -55,7 +55,7 @@ def test_the_readmes_first_commands_exist_and_tests_are_among_them() -> None:
 
 
 def test_a_first_hour_needs_no_address_that_is_not_there() -> None:
-    """Of ours there is none to name; of PX4 there is."""
+    """PX4 has an address, this project has none."""
     assert "git clone REPOSITORY" not in (ROOT / "docs" / "start.md").read_text()
     steps = (ROOT / "docs" / "px4.md").read_text().partition("## A real PX4 on this machine")[2]
     for step in (
@@ -67,7 +67,7 @@ def test_a_first_hour_needs_no_address_that_is_not_there() -> None:
 
 
 def test_the_readme_needs_no_page_that_is_made_from_code() -> None:
-    """It is read in the repository, where these pages are not."""
+    """It is read in the repository, where these pages do not exist."""
     linked = {pages.target(link, "README.md") for link in pages.links(pages.page_text("README.md"))}
     assert not linked & set(pages.generated())
 
@@ -194,7 +194,7 @@ def test_interfaces_tell_calls_as_the_source_has_them() -> None:
 
 
 def imported(source: str) -> Iterator[tuple[str, str]]:
-    """Modules of the product, each with a name that is taken from it; "" for all of it."""
+    """Imported modules of the product with each imported name; "" for a whole module."""
     for node in ast.walk(ast.parse(source)):
         names = []
         if isinstance(node, ast.ImportFrom):
@@ -206,7 +206,7 @@ def imported(source: str) -> Iterator[tuple[str, str]]:
 
 @pytest.mark.parametrize("path", [_GUIDE, *_EXAMPLES], ids=lambda path: path.stem)
 def test_packages_import_what_the_reference_has(path: Path) -> None:
-    """What a package needs has a name that stays: in the API, or on the page of interfaces."""
+    """A package may import names of the API and of the page of interfaces."""
     text = path.read_text()
     if path == _GUIDE:
         text = "\n".join(re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S))

@@ -1,4 +1,4 @@
-"""Coverage cost over team size, by transport: what docs/scaling.md shows."""
+"""Coverage cost over team size, by transport, in docs/scaling.md."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from handbook.scaling_cost import IDEAL, table, teams_of
 
 
 def told(robots: int, worlds: int, costs: dict[str | None, float]) -> dict[str, Any]:
-    """What an evaluation.json has of it."""
+    """The evaluation.json of a team."""
     return {
         "worlds": worlds,
         "conditions": [
