@@ -12,6 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct
+
 from handbook.markdown import code
 from lpac import api
 
@@ -206,7 +208,7 @@ def _class(cls: type) -> str:
         for text in (*_comment(line, _source(cls)), ast.unparse(line))
     ]
     made = next((f for f in definition.body if getattr(f, "name", "") == "__init__"), None)
-    if fields and (dataclasses.is_dataclass(cls) or issubclass(cls, tuple)):
+    if fields and (dataclasses.is_dataclass(cls) or issubclass(cls, tuple | Struct)):
         return "```python\n" + "\n".join(fields) + "\n```"
     return _call(made, cls.__name__, bound=True) if isinstance(made, ast.FunctionDef) else ""
 

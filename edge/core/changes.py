@@ -1,4 +1,4 @@
-"""Exact differences between frozen dataclasses, so that a log need not repeat the rest.
+"""Exact differences between frozen dataclasses or structs, so that a log need not repeat the rest.
 
 Two values are the same if they are so bit by bit: 0.0 and -0.0 are not, and NaN is itself.
 """
@@ -36,7 +36,7 @@ def plain(value: object) -> Any:
 
 
 def changes(before: object, after: object) -> dict[str, Any]:
-    """The fields of `after`, a dataclass, that are not as in `before`; name -> plain value.
+    """The fields of `after`, a dataclass or struct, not as in `before`; name -> plain value.
 
     All of them if `before` is none of its kind. Of dataclasses in it, again the changes.
     """
@@ -59,7 +59,7 @@ def changes(before: object, after: object) -> dict[str, Any]:
         elif name in choices:
             if kind is not type(was) or _encode(was) != _encode(now):
                 told[name] = _chosen(now)
-        elif type(was) is kind and hasattr(kind, "__dataclass_fields__"):
+        elif type(was) is kind and _has_fields(kind):
             if inner := changes(was, now):
                 told[name] = inner
         elif _encode(was) != _encode(now):
@@ -68,7 +68,11 @@ def changes(before: object, after: object) -> dict[str, Any]:
 
 
 def _whole(value: object) -> Any:
-    return changes(None, value) if hasattr(type(value), "__dataclass_fields__") else plain(value)
+    return changes(None, value) if _has_fields(type(value)) else plain(value)
+
+
+def _has_fields(kind: type) -> bool:
+    return hasattr(kind, "__dataclass_fields__") or hasattr(kind, "__struct_fields__")
 
 
 def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
@@ -89,9 +93,9 @@ def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
             if value is not None:
                 ((chosen, of_it),) = value.items()
                 values[name] = _typed(of_it, choices[name][chosen])
-        elif was is not None and dataclasses.is_dataclass(was) and isinstance(value, Mapping):
+        elif was is not None and _has_fields(type(was)) and isinstance(value, Mapping):
             values[name] = changed(type(was), was, value)
-        elif dataclasses.is_dataclass(hints[name]):
+        elif _has_fields(hints[name]):
             values[name] = changed(hints[name], None, value)
         else:
             values[name] = _typed(value, hints[name])
@@ -107,7 +111,7 @@ def _array(_: type, value: object) -> object:
 
 
 class _Kind(NamedTuple):
-    """A dataclass: its fields' names, what takes their values, and their types.
+    """A dataclass or struct: its fields' names, what takes their values, and their types.
 
     `choices` are the fields that may be one of several dataclasses, by their names: they are told
     whole, `{name: fields}`.
@@ -124,7 +128,9 @@ _kinds: dict[type, _Kind] = {}
 
 def _kind(kind: type) -> _Kind:
     if kind not in _kinds:
-        names = tuple(field.name for field in dataclasses.fields(kind))
+        names = getattr(kind, "__struct_fields__", None) or tuple(
+            field.name for field in dataclasses.fields(kind)
+        )
         # The one of a single name gives no tuple.
         values = attrgetter(*names) if len(names) > 1 else lambda o: (getattr(o, names[0]),)
         hints = typing.get_type_hints(kind, include_extras=True)

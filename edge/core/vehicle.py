@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+from msgspec import Struct
+
 Vector = tuple[float, float, float]
 
 
@@ -113,8 +115,7 @@ class GlobalOrigin(NamedTuple):
     altitude_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class VehicleState:
+class VehicleState(Struct, frozen=True):
     """Everything that was heard of the vehicle, the newest of each; None is not heard yet.
 
     `position_local_m` and `velocity_local_m_s` were received together, at `position_at_s`; their

@@ -6,7 +6,7 @@ tick, and what follows from it is not told again and again.
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from edge.core.changes import plain, same
@@ -17,7 +17,7 @@ from edge.flight.step import step
 
 # Processors differ in the last of 16 digits.
 _ROUNDING = 1e-9
-_REST = tuple(f.name for f in fields(FlightMemory) if f.name not in ("state", "reason"))
+_REST = tuple(n for n in FlightMemory.__struct_fields__ if n not in ("state", "reason"))
 
 
 class Differing(NamedTuple):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Literal, NamedTuple
 
-from msgspec import Meta
+from msgspec import Meta, Struct
 
 from edge.core import F64
 from edge.core.fence import Fence
@@ -107,8 +107,7 @@ class FlightParameters(Bounded):
         return self.base_height_m + self.slot * self.slot_spacing_m
 
 
-@dataclass(frozen=True, slots=True)
-class FlightMemory:
+class FlightMemory(Struct, frozen=True):
     """Memory of the machine from tick to tick.
 
     `target_m` is what TAKEOFF and HOLD keep: x and y of the mission frame, and a height.
@@ -151,7 +150,7 @@ class FlightMemory:
     trial: str = ""
     obeyed_expiry_s: float = -math.inf
     answers: tuple[OrderResult, ...] = ()
-    lift: Lift = field(default_factory=Lift)
+    lift: Lift = Lift()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,8 +4,9 @@ Pure: the caller has the clock, and commands the autopilot.
 """
 
 import math
-from dataclasses import replace
 from typing import Any, NamedTuple
+
+from msgspec.structs import replace
 
 from edge.core.vehicle import Action, Mode, Vector, VehicleState
 from edge.flight.alarms import alarms

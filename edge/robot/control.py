@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import NamedTuple
+
+from msgspec.structs import replace
 
 from edge.core.fleet_time import FleetTime
 from edge.core.logger import log

@@ -63,8 +63,11 @@ _SILENT_TICKS, _SILENT_S = 1.5, 1.0
 _STEERS = (FlightState.ARMING, *AIRBORNE)
 # Of what is logged whole.
 _FIELDS: dict[type, tuple[str, ...]] = {
-    kind: tuple(field.name for field in dataclasses.fields(kind))
-    for kind in (RobotStatus, VehicleState, PolicyTick)
+    VehicleState: VehicleState.__struct_fields__,
+    **{
+        kind: tuple(field.name for field in dataclasses.fields(kind))
+        for kind in (RobotStatus, PolicyTick)
+    },
 }
 _VALUES = {kind: attrgetter(*names) for kind, names in _FIELDS.items()}
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)

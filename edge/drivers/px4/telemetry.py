@@ -8,10 +8,11 @@ import re
 import struct
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict
 from threading import Lock
 from types import SimpleNamespace
 from typing import Any, NamedTuple
+
+from msgspec.structs import asdict
 
 from edge.core.vehicle import (
     GPS_CONTROL,

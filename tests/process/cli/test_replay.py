@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from edge.drivers.flight_log import FlightLog, FlightMetadata, read
 from edge.flight.record import FlightTick, TickReader, TickWriter
@@ -97,7 +98,7 @@ def test_a_decision_that_differs_is_shown_and_fails(tmp_path: Path, shipped_bund
         tick = reader.tick(message)
         assert tick is not None
         if len(messages) == 40:  # As if it had landed there.
-            landing = dataclasses.replace(tick.made.flight, state=FlightState.LAND)
+            landing = structs.replace(tick.made.flight, state=FlightState.LAND)
             tick = FlightTick(tick.given, dataclasses.replace(tick.made, flight=landing))
         messages.append((topic, unix_time_s, writer.message(tick)))
     log = write_log(tmp_path, shipped_bundle, messages)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from edge.core.position import (
     PositionCause,
@@ -204,7 +205,7 @@ def test_a_pause_of_the_receiver_stops_a_robot_and_does_not_land_it() -> None:
     for _ in range(34):
         watch.now_s += TICK_S
         silent = dataclasses.replace(GPS, at_s=silent_s)
-        watch.look(dataclasses.replace(heard(watch.now_s), gps=silent))
+        watch.look(structs.replace(heard(watch.now_s), gps=silent))
     assert (watch.judgement.quality, watch.judgement.cause) == (
         _Q.DOUBTFUL,
         PositionCause.GPS_SILENT,
@@ -277,10 +278,10 @@ def test_wrong_positions_are_noticed_when_the_table_says(
         repeats = changes.pop("gps_repeats", 0)
         vehicle = heard(watch.now_s, **changes)
         if silent:
-            vehicle = dataclasses.replace(vehicle, gps=dataclasses.replace(GPS, at_s=since_s))
+            vehicle = structs.replace(vehicle, gps=dataclasses.replace(GPS, at_s=since_s))
         if repeats:
             stuck = dataclasses.replace(GPS, repeats=repeats, at_s=watch.now_s)
-            vehicle = dataclasses.replace(vehicle, gps=stuck)
+            vehicle = structs.replace(vehicle, gps=stuck)
         watch.look(vehicle)
         found.setdefault(watch.judgement.quality, watch.now_s - since_s)
     assert found[_Q.GOOD] == pytest.approx(TICK_S)

@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
+from msgspec import structs
 
 from edge.core.fence import Fence
 from edge.core.vehicle import Action, ActionResult, GlobalOrigin, VehicleState, Velocity
@@ -82,7 +83,7 @@ def test_every_kind_of_value_comes_back(tmp_path: Path) -> None:
                 "by_robot": {3: 0.5}, "array": np.array([[np.nan, 1]], ">f8"),
             },
         )  # fmt: skip
-        log.record("vehicle", NOW + 0.25, dataclasses.asdict(VehicleState()))
+        log.record("vehicle", NOW + 0.25, structs.asdict(VehicleState()))
     (topic, time_s, message), (_, later_s, vehicle) = logged(tmp_path)
     assert (topic, time_s, later_s) == ("control", NOW, NOW + 0.25)
     assert same(message.pop("array"), np.array([[np.nan, 1]], ">f8"))
@@ -160,7 +161,7 @@ def test_mcaps_own_reader_finds_messages_schemas_and_index(tmp_path: Path) -> No
         "status": {"origin": Origin(47.0, 8.0, 0.0)},
         "order": {**dataclasses.asdict(order), "answer": OrderResult("a")},
         "ground": dataclasses.asdict(STATE),
-        "vehicle": dataclasses.asdict(state),
+        "vehicle": structs.asdict(state),
         "/pose": {"position_m": (1.0, 2.0, 3.0), "yaw_rad": math.pi / 2},
         "/log": {"level": "warning", "message": "hello", "name": "robot"},
     }

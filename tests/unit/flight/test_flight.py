@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 from edge.core.fence import Fence
 from edge.core.ports import Odometry
@@ -183,7 +184,7 @@ class World:
     def restart(self) -> None:
         """The robot's program starts anew, and has heard nothing yet."""
         self.flight, self.guidance, self.position = FlightMemory(), Guidance(), PositionJudgement()
-        self.heard, self.beats = replace(self.heard, mode=None, armed=None, in_air=None), []
+        self.heard, self.beats = structs.replace(self.heard, mode=None, armed=None, in_air=None), []
         self.started_s = self.now_s
 
     # Time
@@ -212,9 +213,9 @@ class World:
             if self.watchdog and self.mode is Mode.OFFBOARD and self._silence_s > 0.5:
                 self.mode = self.intended = Mode.HOLD
         connected = self.now_s - self.word_at_s < 2.5
-        self._decide(replace(before, connected=connected))
+        self._decide(structs.replace(before, connected=connected))
         self._pass(TICK_S)
-        self._decide(replace(before, connected=connected))
+        self._decide(structs.replace(before, connected=connected))
         self.ground_on = ground_on
 
     # The ground
@@ -304,7 +305,7 @@ class World:
         for action in self.commands:
             text = self._carry_out(action)
             result = ActionResult(action, not text, text, self.now_s)
-            self.heard = replace(self.heard, result=result)
+            self.heard = structs.replace(self.heard, result=result)
         self.commands = []
         if self.armed and self.intended is Mode.OFFBOARD:
             # PX4's failsafe, which ends when setpoints come again.
@@ -382,7 +383,7 @@ class World:
     def _hear(self) -> VehicleState:
         while self.beats and self.beats[0][0] + self.latency_s <= self.now_s:
             at_s, mode, armed, in_air, failsafe = self.beats.pop(0)
-            self.heard = replace(
+            self.heard = structs.replace(
                 self.heard,
                 mode=mode,
                 armed=armed,
@@ -395,7 +396,7 @@ class World:
                 self.heard_from_s = self.now_s
             self.word_at_s = self.now_s
         known = self.heard.heartbeat_at_s >= max(self.heard_from_s, self.now_s - 10.0)
-        return replace(
+        return structs.replace(
             self.heard,
             connected=known and self.now_s - self.word_at_s < 2.5,
             fell=self.fell,
@@ -807,8 +808,8 @@ def test_an_order_is_refused_where_what_it_needs_is_not_known_or_lost() -> None:
         ("start", {}, {"reached": False}, RefusalCode.NOT_IN_OFFBOARD),
     )
     for kind, heard, memory, code in cases:
-        flight = replace(world.flight, **memory)  # type: ignore[arg-type]
-        vehicle = replace(world._hear(), **heard)  # type: ignore[arg-type]
+        flight = structs.replace(world.flight, **memory)
+        vehicle = structs.replace(world._hear(), **heard)
         t = Tick(world.robot, flight, world.inputs(vehicle))
         refused = refusal(t, world.new_order(kind))
         assert refused is not None and refused.code is code, (kind, heard, memory)
@@ -1214,7 +1215,9 @@ def test_what_stands_on_the_ground_is_landed_whatever_the_autopilot_says(world: 
     while world.flight.landed_since_s is None:
         world.tick()
     for action, at_s in ((Action.DISARM, world.flight.since_s - 1.0), (Action.LAND, world.now_s)):
-        world.heard = replace(world.heard, result=ActionResult(action, False, "denied", at_s))
+        world.heard = structs.replace(
+            world.heard, result=ActionResult(action, False, "denied", at_s)
+        )
         assert ReasonCode.DISARM_REFUSED not in codes(world.tick())
     world.run(8.0)
     assert world.height_m == 0.0 and world.armed
@@ -1253,7 +1256,7 @@ def test_a_receiver_that_repeats_itself_is_ignored_as_long_as_it_does(world: Wor
     world.run(0.3)
     ignored = world.asked(Action.IGNORE_GPS)
     assert ignored
-    world.heard = replace(world.heard, ignores_gps=True)
+    world.heard = structs.replace(world.heard, ignores_gps=True)
     world.run(0.5)
     world.stop(1.0)
     world.run(0.5)
@@ -1265,7 +1268,7 @@ def test_a_receiver_that_repeats_itself_is_ignored_as_long_as_it_does(world: Wor
 
 
 def test_a_vehicle_that_flies_without_a_receiver_on_purpose_is_left_so(world: World) -> None:
-    world.heard = replace(world.heard, ignores_gps=True)
+    world.heard = structs.replace(world.heard, ignores_gps=True)
     world.fly()
     world.run(3.0)
     assert not world.asked(Action.USE_GPS) and not world.asked(Action.IGNORE_GPS)
@@ -1461,7 +1464,7 @@ def test_what_px4_warns_of_in_flight_is_an_alarm(world: World) -> None:
     warning = AutopilotReason(
         "commander_failsafe_enter", (0, 7, 4), "failsafe, battery critical: PX4 lands"
     )
-    world.heard = replace(world.heard, warnings=(warning,))
+    world.heard = structs.replace(world.heard, warnings=(warning,))
     world.enable()
     world.run(1.0)
     assert world.tick().alarms == ()
@@ -1579,7 +1582,7 @@ def test_a_bad_link_to_the_autopilot_is_an_alarm_at_all_times(
     world: World, heard: dict[str, float], code: ReasonCode, text: str
 ) -> None:
     world.ready()
-    world.heard = replace(world.heard, **heard)  # type: ignore[arg-type]
+    world.heard = structs.replace(world.heard, **heard)
     (alarm,) = world.tick().alarms
     assert alarm.code is code and alarm.text.startswith(text)
     world.fly()
@@ -1763,7 +1766,7 @@ def test_a_pilot_wins_over_the_autopilots_failsafe(world: World) -> None:
         world.pilot()
         world.until(FlightState.PILOT, 2.5)
         # PX4 still warns of why it acted.
-        warned = world._decide(replace(world._hear(), failsafe=True))
+        warned = world._decide(structs.replace(world._hear(), failsafe=True))
         assert ReasonCode.FAILSAFE not in codes(warned)
         world.run(4.0)
         assert world.mode is Mode.POSITION
@@ -2147,7 +2150,7 @@ def test_a_ground_that_goes_leaves_preflight(world: World) -> None:
 def test_kill_is_taken_in_every_state(state: FlightState) -> None:
     world = World()
     world.hover()
-    world.flight = replace(world.flight, state=state, since_s=world.now_s, reached=True)
+    world.flight = structs.replace(world.flight, state=state, since_s=world.now_s, reached=True)
     world.obey("kill")
     assert world.state() is FlightState.FAULT
     assert world.actions[-1][1] is Action.KILL
@@ -2218,7 +2221,9 @@ def test_a_row_does_what_its_fields_say() -> None:
     """Whatever its condition is: nothing asks which row it was."""
     world = World()
     world.fly()
-    t = Tick(ROBOT, replace(world.flight, target_m=(1.0, 2.0, 3.0)), world.inputs(world.heard))
+    t = Tick(
+        ROBOT, structs.replace(world.flight, target_m=(1.0, 2.0, 3.0)), world.inputs(world.heard)
+    )
     assert t.flight.reached
     row = Transition(
         (FlightState.MISSION,),
@@ -2240,7 +2245,8 @@ def test_a_row_does_what_its_fields_say() -> None:
     assert (after.alarming, after.land_by, after.killed) == (True, "return", True)
     assert (after.reached, after.target_m) == (False, (1.0, 2.0, 3.0))
     assert after.alone_since_s == after.rejoined_at_s == world.now_s
-    in_hold = replace(t, inputs=replace(t.inputs, vehicle=replace(world.heard, mode=Mode.HOLD)))
+    vehicle = structs.replace(world.heard, mode=Mode.HOLD)
+    in_hold = replace(t, inputs=replace(t.inputs, vehicle=vehicle))
     sometimes = replace(row, left_alone="if in hold")
     assert enter(sometimes, "so", t).alone_since_s is None
     assert enter(sometimes, "so", in_hold).alone_since_s == world.now_s

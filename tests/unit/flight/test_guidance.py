@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 from edge.core import F64
 from edge.core.fence import Fence
@@ -132,7 +133,7 @@ def test_nothing_is_sent_where_the_robot_does_not_steer(state: FlightState) -> N
 
 
 def test_nothing_is_sent_right_after_a_lapse() -> None:
-    silent = replace(flight(FlightState.HOLD, AT_SLOT), silent_until_s=100.5)
+    silent = structs.replace(flight(FlightState.HOLD, AT_SLOT), silent_until_s=100.5)
     assert setpoint(silent, inputs()) is None
 
 
@@ -280,7 +281,7 @@ def test_who_has_parted_stays_there_though_it_hears_nobody_or_the_ground_again()
 
 
 def test_who_does_not_hold_its_height_parts_from_who_is_above_or_below() -> None:
-    lost = replace(flight(FlightState.HOLD, AT_SLOT), lift=Lift(off_since_s=97.0))
+    lost = structs.replace(flight(FlightState.HOLD, AT_SLOT), lift=Lift(off_since_s=97.0))
     for hold, parts in ((lost, True), (flight(FlightState.HOLD, AT_SLOT), False)):
         vehicle = Vehicle(AT_SLOT)
         other = Neighbour(2, (AT_SLOT[0] + 1.0, AT_SLOT[1], SLOT_M - 4.5), STILL, 0.0)

@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
@@ -314,7 +315,7 @@ def test_whatever_is_wrong_is_named_alone(
 def test_whatever_is_wrong_with_the_vehicle_is_named_alone(
     change: dict[str, Any], code: CheckCode, said: str
 ) -> None:
-    vehicle = dataclasses.replace(VEHICLE, **change)
+    vehicle = structs.replace(VEHICLE, **change)
     (failed,) = failed_checks(dataclasses.replace(READY, vehicle=vehicle), LIMITS)
     assert failed.code is code
     assert failed.text.startswith(said)
@@ -323,7 +324,7 @@ def test_whatever_is_wrong_with_the_vehicle_is_named_alone(
 def test_what_settles_under_open_sky_is_marked() -> None:
     settling = set()
     changes = [change for change, _, _ in INPUTS + POSITIONS]
-    changes += [{"vehicle": dataclasses.replace(VEHICLE, **change)} for change, _, _ in VEHICLES]
+    changes += [{"vehicle": structs.replace(VEHICLE, **change)} for change, _, _ in VEHICLES]
     for change in changes:
         failed = failed_checks(dataclasses.replace(READY, **change), LIMITS)
         settling |= {each.code for each in failed if each.settles_by_itself}
@@ -334,7 +335,7 @@ def test_what_settles_under_open_sky_is_marked() -> None:
     }  # fmt: skip
     # A policy that is broken does not mend itself; and what somebody has to do comes first.
     broken: dict[str, Any] = {"has_answer": False, "answer_problem": "it raises"}
-    no_fix = dataclasses.replace(VEHICLE, gps=Gps(2, 14, 0.8))
+    no_fix = structs.replace(VEHICLE, gps=Gps(2, 14, 0.8))
     failed = failed_checks(
         dataclasses.replace(READY, vehicle=no_fix, **broken, origin=None), LIMITS
     )
@@ -352,13 +353,13 @@ def test_everything_that_is_wrong_at_once_is_named(
             "system_id" in change and "system_id" in vehicle_change
         ):
             continue
-        vehicle = dataclasses.replace(VEHICLE, **vehicle_change)
+        vehicle = structs.replace(VEHICLE, **vehicle_change)
         failed = failed_checks(dataclasses.replace(READY, vehicle=vehicle, **change), LIMITS)
         assert sorted(each.code for each in failed) == sorted((code, vehicle_code)), said
 
 
 def test_what_a_lost_autopilot_said_before_counts_for_nothing() -> None:
-    lost = dataclasses.replace(VEHICLE, connected=False, battery=0.1, armed=True)
+    lost = structs.replace(VEHICLE, connected=False, battery=0.1, armed=True)
     (failed,) = failed_checks(dataclasses.replace(READY, vehicle=lost), LIMITS)
     assert failed.code is _C.AUTOPILOT_NOT_CONNECTED
 
@@ -405,7 +406,7 @@ def test_nobody_follows_those_who_took_off_long_ago() -> None:
         )
         assert said(errors=patient, neighbours=wide) == []
     # Who is in the air himself took off with them.
-    (line,) = said(63.0, 63.0, vehicle=dataclasses.replace(VEHICLE, armed=True))
+    (line,) = said(63.0, 63.0, vehicle=structs.replace(VEHICLE, armed=True))
     assert line == "vehicle is armed: disarm it"
 
 
@@ -417,7 +418,7 @@ def lines(
         NEIGHBOUR, landing_point_m=(landing_x_m, 8.0), gps_accuracy_m=its_accuracy_m
     )
     heard = HeardBeacon(neighbour, 99.8)
-    vehicle = dataclasses.replace(VEHICLE, gps=own)
+    vehicle = structs.replace(VEHICLE, gps=own)
     inputs = dataclasses.replace(READY, vehicle=vehicle, neighbours=(heard,), errors=errors)
     failed = failed_checks(inputs, LIMITS)
     assert {each.code for each in failed} <= {_C.LANDINGS_TOO_NEAR}
@@ -444,7 +445,7 @@ def test_nobody_takes_off_where_somebody_may_come_down_who_fell_silent() -> None
     ],
 )
 def test_nobody_waits_for_who_cannot_come_down_here(silent: Neighbour, armed: bool) -> None:
-    vehicle = dataclasses.replace(VEHICLE, armed=armed)
+    vehicle = structs.replace(VEHICLE, armed=armed)
     inputs = dataclasses.replace(READY, fell_silent=(silent,), vehicle=vehicle)
     assert _C.SILENT_NEAR not in {check.code for check in failed_checks(inputs, LIMITS)}
 
@@ -462,7 +463,7 @@ def test_a_receiver_that_reports_worse_than_the_budget_wants_more_room() -> None
         assert ": too near for the GPS accuracy that is reported; change the landing" in line
     assert failed_checks(
         dataclasses.replace(
-            READY, vehicle=dataclasses.replace(VEHICLE, gps=bad), neighbours=()
+            READY, vehicle=structs.replace(VEHICLE, gps=bad), neighbours=()
         ), LIMITS
     ) == ()  # fmt: skip
 
@@ -516,6 +517,6 @@ def test_limits_that_make_no_sense_are_refused_by_name(
 def test_a_version_is_told_with_how_far_it_was_tried_and_not_refused(
     version: str | None, words: str
 ) -> None:
-    vehicle = dataclasses.replace(READY.vehicle, version=version)
+    vehicle = structs.replace(READY.vehicle, version=version)
     assert failed_checks(dataclasses.replace(READY, vehicle=vehicle), LIMITS) == ()
     assert in_words(version) == words

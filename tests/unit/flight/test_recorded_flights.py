@@ -11,6 +11,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from edge.core.changes import changed, changes, same
 from edge.drivers.flight_log import read
@@ -240,7 +241,7 @@ def test_what_is_no_tick_is_one_line() -> None:
 
 def test_what_changed_is_told_alone_and_exactly() -> None:
     first = ticks("normal")[0].given.inputs
-    vehicle = replace(first.vehicle, height_jumped_m=-0.0, battery=math.nan)
+    vehicle = structs.replace(first.vehicle, height_jumped_m=-0.0, battery=math.nan)
     second = replace(first, vehicle=vehicle, order=None, uptime_s=first.uptime_s)
     told = changes(first, second)
     assert told.keys() == {"vehicle"} and told["vehicle"].keys() == {"height_jumped_m", "battery"}

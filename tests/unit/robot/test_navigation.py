@@ -1,12 +1,12 @@
 """From the autopilot's local frame to the mission and back, and when nothing is known."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from edge.core.frames import MissionFrame
 from edge.core.position import PositionJudgement, PositionLimits, PositionQuality
@@ -80,7 +80,7 @@ def test_the_position_is_the_mission_frames_and_its_height_the_takeoff_points() 
     ],
 )
 def test_without_a_fresh_trusted_position_there_is_none(change: dict[str, object]) -> None:
-    vehicle = dataclasses.replace(VEHICLE, **change)  # type: ignore[arg-type]
+    vehicle = structs.replace(VEHICLE, **change)
     assert navigation(vehicle).odometry() is None
 
 
@@ -110,7 +110,7 @@ def test_a_setpoint_at_the_robots_own_place_is_where_the_vehicle_is(
     position_local_m: tuple[float, float, float], datum_m: float
 ) -> None:
     """Also where the estimator's origin is away from the mission's."""
-    vehicle = dataclasses.replace(
+    vehicle = structs.replace(
         VEHICLE,
         position_local_m=position_local_m,
         origin=GlobalOrigin(39.951, -75.162, 30.0),
@@ -134,7 +134,7 @@ def test_when_the_estimators_origin_moves_the_position_stays() -> None:
     before = made.odometry()
     moved_deg = FRAME.to_global_deg(0.0, 7.0)
     north_m, east_m = 7.0 * math.cos(FRAME.heading_rad), 7.0 * math.sin(FRAME.heading_rad)
-    moved = dataclasses.replace(
+    moved = structs.replace(
         VEHICLE,
         origin=GlobalOrigin(*moved_deg, 18.0),
         position_local_m=(3.0 - north_m, 4.0 - east_m, 1.0),
@@ -169,5 +169,5 @@ def test_latitude_and_longitude_need_no_mission() -> None:
     ],
 )
 def test_without_a_fresh_position_there_is_no_latitude(change: dict[str, object]) -> None:
-    vehicle = dataclasses.replace(VEHICLE, **change)  # type: ignore[arg-type]
+    vehicle = structs.replace(VEHICLE, **change)
     assert navigation(vehicle).global_deg(vehicle) is None
