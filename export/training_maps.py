@@ -20,7 +20,7 @@ _MIN_RATIO, _MAX_RATIO = 0.4, 1.1
 
 
 def outside_share(cnn: Cnn) -> float | None:
-    """Share of the training's local maps that lay outside the world; None if it cannot be told."""
+    """Share of the training's local maps that lay outside the world; None if unknown."""
     first = cnn.convolutions[0]
     sums = first.weight.sum((2, 3), dtype=np.float64)
     means = np.asarray(first.norm.mean, np.float64) - first.bias

@@ -9,5 +9,5 @@ T = TypeVar("T", bound=Hashable)
 
 def commonest(values: Iterable[T | None]) -> T | None:
     """Value of most of those that have one; of equals the first."""
-    said = Counter(value for value in values if value)
-    return max(said, key=said.__getitem__, default=None)
+    counts = Counter(value for value in values if value)
+    return max(counts, key=counts.__getitem__, default=None)

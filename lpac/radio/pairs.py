@@ -94,7 +94,7 @@ class Pair(NamedTuple):
 
 
 def pairs(windows: Mapping[str, Window]) -> tuple[Pair, ...]:
-    """Pairs by name of which the sender sent; windows must be of about the same time."""
+    """Pairs of which the sender sent anything; windows must be of about the same time."""
     found = (
         _pair(sender, receiver, windows[sender], windows[receiver])
         for receiver in windows
