@@ -1,4 +1,4 @@
-"""The pure part: no clock, thread, file or socket; the caller passes the time."""
+"""Pure functions and types: no clock, thread, file or socket; callers pass the time."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,21 +1,21 @@
-"""Hosts, addresses and endpoints as people write them.
+"""Parses hosts, addresses and endpoints in configurations.
 
-An address has one reading here: that of Python's `ipaddress`. C's inet_aton, by which ssh, ping and
-zenoh go, has others besides: 192.168.8.011 is octal for 192.168.8.9, and 10.1 is 10.0.0.1; and
-int() takes other scripts' digits. So what is read anywhere has to pass here first.
+Addresses are read as by Python's `ipaddress`. C's inet_aton, used by ssh, ping and zenoh, has other
+readings: 192.168.8.011 is octal for 192.168.8.9, and 10.1 is 10.0.0.1; and int() accepts digits of
+other scripts. Check every address here before it is used.
 """
 
 import ipaddress
 import re
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
-# Labels that inet_aton takes for numbers, or none: 10.1, 0x7f000001, 192.168.8.9.
+# Labels that inet_aton reads as numbers: 10.1, 0x7f000001, 192.168.8.9; or none.
 _NUMBERS = re.compile(r"(0[xX][0-9A-Fa-f]*|[0-9]*)(\.(0[xX][0-9A-Fa-f]*|[0-9]*))*")
 _PLACE = re.compile(r"(\[(?P<ipv6>[^\[\]]*:[^\[\]]*)\]|(?P<host>[^:\[\]]+)):(?P<port>[0-9]{1,5})")
 
 
 def ipv4(text: str) -> ipaddress.IPv4Address | None:
-    """The IPv4 address that it is, None if it is none."""
+    """Parse an IPv4 address; None if it is invalid."""
     try:
         return ipaddress.IPv4Address(text)
     except ValueError:
@@ -23,7 +23,7 @@ def ipv4(text: str) -> ipaddress.IPv4Address | None:
 
 
 def same_host(host: str) -> str:
-    """One text for all spellings of one address; a name is itself."""
+    """Normalise the spelling of an address; names stay unchanged."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
@@ -33,7 +33,7 @@ def same_host(host: str) -> str:
 
 
 def require_host(key: str, host: str) -> None:
-    """Raise ValueError, one line, unless it is an IPv4 or IPv6 address or a name."""
+    """Raise ValueError, one line, unless `host` is an IPv4 or IPv6 address or a name."""
     try:
         ipaddress.ip_address(host)
     except ValueError:
@@ -50,9 +50,9 @@ def require_host(key: str, host: str) -> None:
 
 
 def host_and_port(key: str, place: str) -> tuple[str, int] | None:
-    """Of HOST:PORT, where an IPv6 address is in brackets; None if it has another form.
+    """Split HOST:PORT, with an IPv6 address in brackets; None for another form.
 
-    Raises ValueError, one line, if the host is none.
+    Raises ValueError, one line, for an invalid host.
     """
     match = _PLACE.fullmatch(place)
     if match is None or int(match["port"]) > 65535:
@@ -63,7 +63,7 @@ def host_and_port(key: str, place: str) -> tuple[str, int] | None:
 
 
 def require_endpoint(key: str, endpoint: str, *schemes: str) -> None:
-    """Raise ValueError, one line, unless it is SCHEME/HOST:PORT with one of the schemes."""
+    """Raise ValueError, one line, unless `endpoint` is SCHEME/HOST:PORT with one of the schemes."""
     scheme, _, place = endpoint.partition("/")
     if scheme not in schemes or host_and_port(key, place) is None:
         forms = ", or ".join(f"{scheme}/ADDRESS:PORT" for scheme in schemes)
@@ -71,7 +71,7 @@ def require_endpoint(key: str, endpoint: str, *schemes: str) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server bound to `host`."""
+    """Whether only this machine can reach a server bound to `host`."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -79,5 +79,5 @@ def is_loopback(host: str) -> bool:
 
 
 def is_loopback_endpoint(endpoint: str) -> bool:
-    """Whether an endpoint such as tcp/127.0.0.1:7447 is out of other computers' reach."""
+    """Whether only this machine can reach an endpoint such as tcp/127.0.0.1:7447."""
     return is_loopback(endpoint.partition("/")[2].rpartition(":")[0].strip("[]"))

@@ -1,4 +1,4 @@
-"""The aggregated message of a graph neural network, and its update from the neighbours' messages.
+"""The graph neural network's aggregated messages.
 
 Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
 Perception-Action-Communication Loops", section "Decentralized Graph Neural Networks".
@@ -22,7 +22,7 @@ from edge.core.shared_map import SharedMap
 class Geometry(Bounded):
     """Sizes of the graph neural network: L layers of K hops, F_0 .. F_L features.
 
-    Raises ValueError that names the size for an impossible value.
+    Raises ValueError that names an impossible size.
     """
 
     hops: AtLeastOne
@@ -41,15 +41,15 @@ class Geometry(Bounded):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AggregatedMessage:
-    """A robot's message to its neighbours: Y_j, and where it is.
+    """A robot's message to its neighbours: Y_j, and its place.
 
-    `payload` is (message_size,), float32 or float16: (y_j)_kl in the order [l][k][feature],
-    already multiplied by 1/sqrt(d_j), d_j being the sender's number of neighbours.
-    `position_m` and `velocity_m_s` are in the mission frame that `frame_id` stands for
-    (`MissionFrame.frame_id`); `sent` is when, None as long as the sender does not know the time.
-    `boot_epoch` grows with every start of the sender, `sequence` with every message of one start.
-    `shared` is what it knows around it, if robots share maps, and `trial` the mission that it knows
-    it of: what was seen in another one is not to be known.
+    `payload` (message_size,) is float32 or float16: (y_j)_kl in the order [l][k][feature], times
+    1/sqrt(d_j), where d_j is the sender's number of neighbours. `position_m` and `velocity_m_s` are
+    in the mission frame with the id `frame_id` (`MissionFrame.frame_id`). `sent` is the time of
+    sending, None while the sender does not know the time. `boot_epoch` grows with each start of the
+    sender, `sequence` with each message of one start. `shared` is the sender's map of its
+    surroundings, if robots share maps, and `trial` the mission of that map: maps of other missions
+    are discarded.
     """
 
     robot_id: int
@@ -67,19 +67,19 @@ class AggregatedMessage:
 class HopBuffer:
     """Robots' y_kl for k = 0..K and l = 1..L, updated in place once per policy tick.
 
-    A robot has one for itself alone. Not thread-safe: it belongs to the policy thread.
+    Each robot has its own. Not thread-safe: it belongs to the policy thread.
     """
 
     def __init__(self, geometry: Geometry, robots: int = 1) -> None:
         self._hops = geometry.hops
         inputs = geometry.feature_sizes[:-1]
-        # One block per layer, (robots, K + 1, F_{l-1}): what the layer's graph takes, a batch.
+        # One block per layer, (robots, K + 1, F_{l-1}), the input batch of the layer's graph.
         self.layers: tuple[F32, ...] = tuple(
             np.zeros((robots, geometry.hops + 1, size), np.float32) for size in inputs
         )
         self._sum = np.zeros(geometry.message_size, np.float32)
         ends = np.cumsum([geometry.hops * size for size in inputs])
-        # Where in the sum each layer's part is; no views, which a copy would tear from it.
+        # Slice of each layer in the sum. A deep copy would separate views from the sum.
         self._parts = tuple(
             slice(end - geometry.hops * size, end)
             for end, size in zip(ends.tolist(), inputs, strict=True)
@@ -88,9 +88,9 @@ class HopBuffer:
     def diffuse(self, payloads: Sequence[F32], degree: int, robot: int = 0) -> None:
         """y_kl = sum over neighbours j of S_ij (y_j)_{k-1,l}, for k = 1..K and all layers at once.
 
-        `payloads` are the neighbours' messages, (message_size,) each, and `degree` is d_i: larger
-        than their number if some neighbours were not heard this time.
-        S_ij = 1/sqrt(d_i d_j): the sender has multiplied by its own part.
+        `payloads` are the neighbours' messages, (message_size,) each. `degree` is d_i, larger than
+        their number if some messages were not received. S_ij = 1/sqrt(d_i d_j), where the sender
+        has applied its own factor.
         """
         if payloads:
             received = np.concatenate(payloads, dtype=np.float32).reshape(len(payloads), -1)
@@ -102,6 +102,6 @@ class HopBuffer:
             layer[robot, 1:] = self._sum[part].reshape(self._hops, -1)
 
     def message(self, degree: int, robot: int = 0) -> F32:
-        """A new (message_size,) payload: y_kl for k = 0..K-1, times 1/sqrt(degree); 0 if none."""
+        """A new payload (message_size,): y_kl for k = 0..K-1, times 1/sqrt(degree), or 0."""
         scale = np.float32(1.0 / math.sqrt(degree) if degree else 0.0)
         return np.concatenate([layer[robot, : self._hops].ravel() for layer in self.layers]) * scale

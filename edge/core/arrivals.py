@@ -1,6 +1,6 @@
-"""How many of another robot's messages arrived, and how old they were: counts that only grow.
+"""Monotonic counts of the messages received from another robot, by age.
 
-Whoever listens takes the difference of two of them, over whatever time he likes.
+The difference of two counts is the reception in between.
 """
 
 from bisect import bisect_left, bisect_right
@@ -8,17 +8,17 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
-# Where an age's bin ends and the next one begins. 0.8 s is when messages are forgotten; the first
-# is as much as robots do not know of each other's clocks on a good radio.
+# Upper edges of the age bins. Robots discard messages after 0.8 s; the first edge is the clocks'
+# uncertainty on a good radio.
 AGE_EDGES_S = (0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 _BINS = len(AGE_EDGES_S) + 1
 
 
 class Arrivals(NamedTuple):
-    """Of what one robot says, what came to another.
+    """Messages of one robot received by another.
 
-    `sent` is how many messages it said, by their sequence, from the first that came to the newest
-    that did. `undated` came at an age that is not known, `by_age` (9,) at ages in the bins between
+    `sent` is the number of messages sent, by their sequence, from the first to the newest received
+    one. `undated` counts messages of unknown age, `by_age` (9,) those with ages in the bins of
     `AGE_EDGES_S`.
     """
 
@@ -28,13 +28,13 @@ class Arrivals(NamedTuple):
 
     @classmethod
     def of_counts(cls, counts: Sequence[int]) -> "Arrivals":
-        """The inverse of `counts`; more bins than there are here are one."""
+        """Inverse of `counts`; bins beyond those here are merged into the last."""
         sent, undated, *by_age = (*counts, *(0,) * (2 + _BINS))
         return cls(sent, undated, (*by_age[: _BINS - 1], sum(by_age[_BINS - 1 :])))
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """`sent`, `undated` and `by_age`, but for zeros at the end: short, for messages."""
+        """`sent`, `undated` and `by_age` without trailing zeros, for messages."""
         numbers = [self.sent, self.undated, *self.by_age]
         while numbers and not numbers[-1]:
             numbers.pop()
@@ -42,7 +42,7 @@ class Arrivals(NamedTuple):
 
     @property
     def arrived(self) -> int:
-        """How many came."""
+        """Number of received messages."""
         return self.undated + sum(self.by_age)
 
     def since(self, before: "Arrivals") -> "Arrivals":
@@ -53,7 +53,7 @@ class Arrivals(NamedTuple):
         )
 
     def plus(self, sent: int, age_s: float | None) -> "Arrivals":
-        """With one that came so old, and `sent` more that were said."""
+        """Add a received message with this age, and `sent` sent ones."""
         if age_s is None:
             return self._replace(sent=self.sent + sent, undated=self.undated + 1)
         at, by_age = bisect_right(AGE_EDGES_S, age_s), list(self.by_age)
@@ -61,14 +61,13 @@ class Arrivals(NamedTuple):
         return Arrivals(self.sent + sent, self.undated, tuple(by_age))
 
     def older_than(self, edge_s: float) -> int:
-        """How many came as old as one of `AGE_EDGES_S`, or older."""
+        """Number of messages of at least this age, one of `AGE_EDGES_S`."""
         return sum(self.by_age[AGE_EDGES_S.index(edge_s) + 1 :])
 
     def age_s(self, share: float) -> float | None:
-        """The age that this share (0 to 1) of those with an age came within; None if none did.
+        """Quantile of the ages for `share` (0 to 1); None without ages.
 
-        Within a bin ages are taken to be spread evenly; of those past the last edge only that is
-        known, and it is told.
+        Ages are interpolated within a bin. Beyond the last edge the result is that edge.
         """
         upto = list(accumulate(self.by_age))
         if upto[-1] <= 0:

@@ -1,6 +1,6 @@
-"""Exact differences between frozen dataclasses or structs, so that a log need not repeat the rest.
+"""Exact differences between frozen dataclasses or structs, for logs without repetition.
 
-Two values are the same if they are so bit by bit: 0.0 and -0.0 are not, and NaN is itself.
+Values are equal if their bits are: 0.0 and -0.0 differ, and NaN equals itself.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def _listed(value: object) -> object:
-    """Encode arrays, which msgspec does not know, by their numbers alone."""
+    """Encode arrays, unknown to msgspec, as lists of numbers."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     raise NotImplementedError(f"a {type(value).__name__}")
@@ -26,19 +26,19 @@ _encode = msgspec.msgpack.Encoder(enc_hook=_listed).encode
 
 
 def same(one: object, other: object) -> bool:
-    """Whether they are so bit by bit; dataclasses, named tuples, arrays, and what is in them."""
+    """Whether two values are equal bit by bit, including dataclasses, named tuples and arrays."""
     return one is other or _encode(one) == _encode(other)
 
 
 def plain(value: object) -> Any:
-    """The value in JSON's types; numbers that are not finite stay numbers."""
+    """Convert to JSON's types; numbers that are not finite stay numbers."""
     return msgspec.to_builtins(value, enc_hook=_listed)
 
 
 def changes(before: object, after: object) -> dict[str, Any]:
-    """The fields of `after`, a dataclass or struct, not as in `before`; name -> plain value.
+    """Fields of the dataclass or struct `after` that differ from `before`; name -> plain value.
 
-    All of them if `before` is none of its kind. Of dataclasses in it, again the changes.
+    All fields if `before` is of another type. Nested dataclasses are compared in the same way.
     """
     names, values, _, choices = _kind(type(after))
     if type(before) is not type(after):
@@ -49,11 +49,11 @@ def changes(before: object, after: object) -> dict[str, Any]:
     told: dict[str, Any] = {}
     for name, was, now in zip(names, values(before), values(after), strict=True):
         if now is was:
-            # Mostly: whoever replaces some fields keeps the others.
+            # The usual case: replaced dataclasses keep other fields.
             continue
         kind = type(now)
         if kind is float:
-            # Mostly, again. A zero is told anew: it may have another sign.
+            # The next most frequent case. Zeros are included, since their signs may differ.
             if now != was or not now:
                 told[name] = now
         elif name in choices:
@@ -76,7 +76,7 @@ def _has_fields(kind: type) -> bool:
 
 
 def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
-    """Apply `changes` to `before`; None: `told` is all of it.
+    """Apply `changes` to `before`; if that is None, `told` has all fields.
 
     Numbers that are not finite may be text. Raises ValueError or TypeError if `told` does not fit.
     """
@@ -111,10 +111,10 @@ def _array(_: type, value: object) -> object:
 
 
 class _Kind(NamedTuple):
-    """A dataclass or struct: its fields' names, what takes their values, and their types.
+    """A dataclass or struct: names of its fields, getter of their values, and their types.
 
-    `choices` are the fields that may be one of several dataclasses, by their names: they are told
-    whole, `{name: fields}`.
+    `choices` are fields that may be one of several dataclasses, by name: their changes are whole,
+    `{name: fields}`.
     """
 
     names: tuple[str, ...]
@@ -131,7 +131,7 @@ def _kind(kind: type) -> _Kind:
         names = getattr(kind, "__struct_fields__", None) or tuple(
             field.name for field in dataclasses.fields(kind)
         )
-        # The one of a single name gives no tuple.
+        # attrgetter of a single name returns no tuple.
         values = attrgetter(*names) if len(names) > 1 else lambda o: (getattr(o, names[0]),)
         hints = typing.get_type_hints(kind, include_extras=True)
         choices: dict[str, dict[str, type]] = {}

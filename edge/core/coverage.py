@@ -1,13 +1,13 @@
 """Coverage of a raster by a swarm: cost, Voronoi cells, and steps towards their centroids.
 
-A raster is (rows, columns) float32, indexed [x, y]; its cell (i, j) covers [i, i+1) x [j, j+1)
-in model units and acts as one weight at its centre (i + 0.5, j + 0.5). Positions are in model
-units with the raster's corner as origin. Every function here is exact, sums in float64, and takes
-robots at one point, on the border and outside the raster.
+A raster is (rows, columns) float32, indexed [x, y]; its cell (i, j) covers [i, i+1) x [j, j+1) in
+model units and counts as one weight at its centre (i + 0.5, j + 0.5). Positions are in model units
+from the raster's corner. All functions are exact with float64 sums, and allow robots at one point,
+on the border and outside the raster.
 
-These are the parts of the baselines, Lloyd's algorithm on centroidal Voronoi tessellations (CVT):
-ClairvoyantCVT runs `voronoi_cells` on the true density, CentralizedCVT on what the swarm has seen
-so far, and DecentralizedCVT runs `local_centroid` on what each robot has seen around itself.
+They are parts of the baselines, Lloyd's algorithm on centroidal Voronoi tessellations (CVT):
+ClairvoyantCVT uses `voronoi_cells` on the true density, CentralizedCVT on the part seen by the
+swarm, and DecentralizedCVT uses `local_centroid` on the part seen by each robot.
 """
 
 from collections.abc import Iterator
@@ -19,9 +19,9 @@ import numpy.typing as npt
 
 from edge.core import F32, F64
 
-# Below this mass a Voronoi cell counts as empty; the reference library's threshold.
+# Voronoi cells of less mass count as empty; the reference library's threshold.
 _EMPTY_MASS = 1e-10
-# A corner closer than this to a bisector lies on it: four robots on a circle share one corner.
+# Corners closer to a bisector lie on it: four robots on a circle share one corner.
 _ON_BISECTOR = 1e-9
 
 
@@ -29,9 +29,9 @@ _ON_BISECTOR = 1e-9
 class VoronoiCells:
     """One Voronoi cell per robot: each raster cell belongs to the nearest robot.
 
-    `mass` (N,) is the importance in the cell, `centroid` (N, 2) where Lloyd's algorithm sends the
-    robot, `cost` (N,) the sum of importance times squared distance from the robot. The masses add
-    up to the raster's, the costs to `coverage_cost`.
+    `mass` (N,) is the importance in the cell, `centroid` (N, 2) the robot's goal in Lloyd's
+    algorithm, `cost` (N,) the sum of importance times squared distance from the robot. Masses sum
+    to the raster's, costs to `coverage_cost`.
     """
 
     mass: F64
@@ -55,14 +55,14 @@ def coverage_cost(importance: F32, positions: F64) -> float:
 
 
 def voronoi_cells(importance: F32, positions: F64) -> VoronoiCells:
-    """The Voronoi cells of robots at `positions` (N, 2), N >= 1, on `importance` (rows, columns).
+    """Voronoi cells of robots at `positions` (N, 2), N >= 1, on `importance` (rows, columns).
 
-    Of equally near robots the first owns the raster cell. So of several robots at one point the
-    first owns all of their cells and the others nothing. (The reference library counts the cells
-    once for each of them, and its cost with them.)
+    Of equally near robots the first owns a raster cell, so of several robots at one point the first
+    owns all of their cells. (The reference library counts these cells, and their cost, once per
+    robot.)
 
-    The centroid of an empty cell is the mean of the cell's corners, as in the reference library;
-    for a robot outside the raster whose cell does not reach it, the raster's nearest point.
+    The centroid of an empty cell is the mean of its corners, as in the reference library; for a
+    robot outside the raster without a cell on it, the raster's nearest point.
     """
     moments = _moments(importance, positions)
     centroid = [_centroid(m, importance.shape, positions, i) for i, m in enumerate(moments)]
@@ -74,10 +74,10 @@ def local_centroid(
 ) -> F64:
     """Centroid (2,) of one robot's Voronoi cell among its neighbours', within its own window.
 
-    `window` (rows, columns) is the part of the robot's map that it looks at, already clipped to the
-    world, and `origin_cell` the index of the window's first cell in the world's raster.
-    `position` (2,) and `neighbours` (n, 2), n >= 0, are in the world's model units; neighbours may
-    be outside the window. Empty cells are treated as by `voronoi_cells`.
+    `window` (rows, columns) is a part of the robot's map, clipped to the world, and `origin_cell`
+    the index of its first cell in the world's raster. `position` (2,) and `neighbours` (n, 2), n >=
+    0, are in the world's model units; neighbours may be outside the window. Empty cells are treated
+    as in `voronoi_cells`.
     """
     origin = np.array(origin_cell, np.float64)
     positions = np.vstack([position, neighbours]) - origin
@@ -86,9 +86,9 @@ def local_centroid(
 
 
 def cvt_velocity(positions: F64, goals: F64, max_speed: float, time_step: float) -> F64:
-    """Velocities (N, 2) towards `goals` (N, 2): at `max_speed`, or so as to arrive in `time_step`.
+    """Velocities (N, 2) towards `goals` (N, 2) at `max_speed`, or slower to arrive in `time_step`.
 
-    The units are those of the arguments: model units, model units per second, seconds.
+    Units are those of the arguments: model units, model units per second, seconds.
     """
     offset = goals - positions
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
@@ -100,7 +100,7 @@ class _Block(NamedTuple):
     """A part of the raster and, in ascending order, the robots that may be nearest to its cells.
 
     `x` (rows,) and `y` (columns,) are the cells' centres, `dx2` (robots, rows) and `dy2`
-    (robots, columns) the two parts of the squared distances from the robots to them.
+    (robots, columns) the parts of the squared distances from the robots to them.
     """
 
     importance: F32
@@ -112,9 +112,9 @@ class _Block(NamedTuple):
 
 
 def _blocks(importance: F32, positions: F64) -> Iterator[_Block]:
-    """Cuts the raster into blocks with few robots each, leaving out blocks without importance."""
+    """Cut the raster into blocks with few robots each, without blocks of no importance."""
     x, y = (np.arange(cells, dtype=np.float64) + 0.5 for cells in importance.shape)
-    # Of a crowd at one point only the first owns anything; the others would only be in the way.
+    # Of robots at one point only the first owns cells; drop the others.
     first_at_point = np.sort(np.unique(positions, axis=0, return_index=True)[1])
     todo = [(0, len(x), 0, len(y), first_at_point)]
     while todo:
@@ -124,7 +124,7 @@ def _blocks(importance: F32, positions: F64) -> Iterator[_Block]:
             continue
         px, py = positions[robots].T[:, :, None]
         robots = robots[_may_own((x[[x0, x1 - 1]] - px) ** 2, (y[[y0, y1 - 1]] - py) ** 2)]
-        # Splitting costs time per block, robots in a block time per cell: the best size is flat.
+        # Splitting costs time per block, robots in a block time per cell; the optimum is flat.
         if max(x1 - x0, y1 - y0) > max(32, 512 // len(robots)):
             xm, ym = (x0 + x1) // 2, (y0 + y1) // 2
             todo += [(x0, xm, y0, ym, robots), (x0, xm, ym, y1, robots)]
@@ -136,11 +136,11 @@ def _blocks(importance: F32, positions: F64) -> Iterator[_Block]:
 
 
 def _may_own(dx2: F64, dy2: F64) -> npt.NDArray[np.bool_]:
-    """(k,): which of k robots can be nearest to a point of a rectangle.
+    """Which of k robots can be nearest to a point of a rectangle, (k,).
 
     `dx2` and `dy2`, (k, 2) each, are the parts of the squared distances to its sides. The
-    difference of two robots' squared distances is linear in the point, so that a robot farther
-    than another at all four corners is farther everywhere between them.
+    difference of two robots' squared distances is linear in the point, so a robot that is farther
+    than another at all four corners is farther everywhere in between.
     """
     d2 = (dx2[:, :, None] + dy2[:, None, :]).reshape(-1, 4)
     central = d2[d2.max(axis=1).argmin()]
@@ -149,7 +149,7 @@ def _may_own(dx2: F64, dy2: F64) -> npt.NDArray[np.bool_]:
 
 
 def _moments(importance: F32, positions: F64) -> F64:
-    """(N, 4): each Voronoi cell's mass, first moments in x and y, second moment about the robot."""
+    """Each Voronoi cell's mass, first moments in x and y, second moment about the robot, (N, 4)."""
     moments = np.zeros((len(positions), 4))
     for block in _blocks(importance, positions):
         nearest = np.add.outer(block.dx2[0], block.dy2[0])
@@ -161,7 +161,7 @@ def _moments(importance: F32, positions: F64) -> F64:
         weight = block.importance.astype(np.float64)
         for i, robot in enumerate(block.robots):
             own = weight * (owner == i)
-            # Each moment is a sum of a term in x and a term in y: row and column sums suffice.
+            # Each moment is a sum of a term in x and one in y: row and column sums suffice.
             rows, columns = own.sum(axis=1), own.sum(axis=0)
             second = rows @ block.dx2[i] + columns @ block.dy2[i]
             moments[robot] += rows.sum(), rows @ block.x, columns @ block.y, second
@@ -169,7 +169,7 @@ def _moments(importance: F32, positions: F64) -> F64:
 
 
 def _centroid(moments: F64, size: tuple[int, ...], positions: F64, robot: int) -> F64:
-    """(2,): the centroid of the robot's cell, or what stands for it when the cell is empty."""
+    """Centroid (2,) of the robot's cell, or its substitute for an empty cell."""
     centroid: F64
     if moments[0] >= _EMPTY_MASS:
         centroid = moments[1:3] / moments[0]
@@ -181,9 +181,9 @@ def _centroid(moments: F64, size: tuple[int, ...], positions: F64, robot: int) -
 
 
 def cell_corners(size: tuple[float, ...], positions: F64, robot: int) -> F64:
-    """(n, 2): corners of the robot's Voronoi cell in [0, size[0]] x [0, size[1]]; n may be 0.
+    """Corners (n, 2) of the robot's Voronoi cell in [0, size[0]] x [0, size[1]]; n may be 0.
 
-    `positions` is (N, 2), `robot` one of their indices. Robots at one point share their cell.
+    `positions` is (N, 2), `robot` an index. Robots at one point share their cell.
     """
     position = positions[robot]
     corners = np.array([(0.0, 0.0), (size[0], 0.0), size, (0.0, size[1])])
@@ -194,7 +194,7 @@ def cell_corners(size: tuple[float, ...], positions: F64, robot: int) -> F64:
             continue
         reach = np.linalg.norm(corners - position, axis=1).max(initial=0.0)
         if distances[j] > 2.0 * reach:
-            break  # this bisector, and all that follow, pass outside the cell
+            break  # this and all following bisectors pass outside the cell
         # Cut off what lies beyond the bisector between the two robots.
         beyond = (corners - position) @ offsets[j] / distances[j] - distances[j] / 2.0
         beyond[np.abs(beyond) < _ON_BISECTOR] = 0.0

@@ -1,4 +1,4 @@
-"""The geofence: a convex polygon in the mission frame, with a floor and a ceiling."""
+"""Geofence: a convex polygon in the mission frame, with a floor and a ceiling."""
 
 import functools
 import math
@@ -13,19 +13,19 @@ from edge.core.schema import Bounded, NonNegative, Positive
 
 _Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
 _Vertex = Annotated[tuple[_Coordinate, ...], Meta(min_length=2, max_length=2, description="[x, y]")]
-# An angle, rad, below which three vertices lie on one line.
+# Three vertices with a smaller angle, rad, are on one line.
 _STRAIGHT_RAD = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Fence(Bounded):
-    """Where the robot may fly: a convex polygon, m, and heights from `floor_m` to `ceiling_m`.
+    """Permitted volume: a convex polygon, m, and heights from `floor_m` to `ceiling_m`.
 
-    `vertices_m` are (x, y), 3 to 100, either way round; the last is joined to the first.
-    Robots stop `buffer_m` inside the line.
+    `vertices_m` are 3 to 100 points (x, y) in either orientation, closed. Robots stop `buffer_m`
+    inside the line.
 
-    Raises ValueError if the polygon is not convex, has no room within the buffer, or a number is
-    not finite or out of its range.
+    Raises ValueError if the polygon is not convex or has no room within the buffer, or a number is
+    out of range.
     """
 
     vertices_m: Annotated[tuple[_Vertex, ...], Meta(min_length=3, max_length=100)]
@@ -51,16 +51,16 @@ class Fence(Bounded):
             )
 
     def distance_m(self, x_m: float, y_m: float) -> float:
-        """Distance to the line, m: positive inside; outside, minus how far beyond the worst edge.
+        """Distance to the line, m: positive inside; outside, minus the distance to the worst edge.
 
-        NaN where x or y is.
+        NaN if x or y is.
         """
         return float(np.minimum.reduce(self.edges().distances_m(np.array([x_m, y_m]))))
 
     def moved_inside_m(self, x_m: float, y_m: float, depth_m: float) -> tuple[float, float]:
-        """The place itself if it is `depth_m` inside every line, else the nearest that is, m.
+        """The nearest place that is `depth_m` inside every line, m, possibly the place itself.
 
-        `depth_m` is at most `buffer_m`, so that there is one. NaN where x or y is.
+        `depth_m` is at most `buffer_m`, so there is one. NaN if x or y is.
         """
         if self.distance_m(x_m, y_m) >= depth_m:
             return x_m, y_m
@@ -73,9 +73,9 @@ class Fence(Bounded):
         return float(x_m), float(y_m)
 
     def grown_m(self, margin_m: float) -> tuple[tuple[float, float], ...]:
-        """Corners (x, y) of the polygon whose every line lies `margin_m` further out.
+        """Corners (x, y) of the polygon with every line moved outward by `margin_m`.
 
-        Inward, by at most `buffer_m`, an edge that is short may be gone.
+        A negative margin, of at most `buffer_m`, may remove short edges.
         """
         edges = self.edges()
         if margin_m < 0.0:
@@ -90,23 +90,23 @@ class Fence(Bounded):
         return tuple((float(x_m), float(y_m)) for x_m, y_m in corners)
 
     def edges(self) -> "Edges":
-        """The lines of its polygon."""
+        """Half planes of the polygon."""
         return _edges(self.vertices_m)
 
 
 class Edges(NamedTuple):
-    """A polygon's half planes: inward unit normals (n, 2), and offsets (n,), m."""
+    """Half planes of a polygon: inward unit normals (n, 2), and offsets (n,), m."""
 
     inward: F64
     offsets_m: F64
 
     def distances_m(self, point_m: F64) -> F64:
-        """(n,): how far inside each edge's line a point (2,) is."""
+        """Distances (n,) of a point (2,) inside each edge's line."""
         along_m: F64 = self.inward.dot(point_m)
         return along_m - self.offsets_m
 
 
-@functools.lru_cache(maxsize=64)  # asked for many times in each tick of the control loop
+@functools.lru_cache(maxsize=64)  # used many times in each tick of the control loop
 def _edges(vertices_m: tuple[tuple[float, ...], ...]) -> Edges:
     corners = np.array(vertices_m)
     along = np.roll(corners, -1, axis=0) - corners
@@ -119,9 +119,9 @@ def _edges(vertices_m: tuple[tuple[float, ...], ...]) -> Edges:
     return edges
 
 
-@functools.lru_cache(maxsize=64)  # robots tell the same one with every status
+@functools.lru_cache(maxsize=64)  # robots send the same polygon with every status
 def _depth_m(vertices_m: tuple[tuple[float, ...], ...]) -> float | None:
-    """Return how far a polygon's centroid is inside its line; None if it is not convex."""
+    """Depth of the polygon's centroid inside its line; None if it is not convex."""
     corners = np.array(vertices_m)
     if not _is_convex(corners):
         return None
@@ -129,7 +129,7 @@ def _depth_m(vertices_m: tuple[tuple[float, ...], ...]) -> float | None:
 
 
 def _cut(corners: F64, inward: F64, offset_m: float) -> F64:
-    """Clip a convex polygon (n, 2) to that side of a line."""
+    """Clip a convex polygon (n, 2) to the inner side of a line."""
     inside_m = corners @ inward - offset_m
     kept = []
     for k in range(len(corners)):
@@ -142,7 +142,7 @@ def _cut(corners: F64, inward: F64, offset_m: float) -> F64:
 
 
 def _area(corners: F64) -> float:
-    """The area inside corners (n, 2), positive if they run counterclockwise."""
+    """Area within corners (n, 2), positive if they are counterclockwise."""
     x, y = corners.T
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
@@ -156,7 +156,7 @@ def _centroid(corners: F64) -> tuple[float, float]:
 
 
 def _is_convex(corners: F64) -> bool:
-    """Whether the corners turn one way all round, and once."""
+    """Whether the corners turn in one direction, once around."""
     if abs(_area(corners - corners[0])) < 1e-9:
         return False
     along = np.roll(corners, -1, axis=0) - corners

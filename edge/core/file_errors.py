@@ -1,4 +1,4 @@
-"""Errors of files, in words that tell a person what to do."""
+"""Texts for errors of files."""
 
 import errno
 
@@ -16,10 +16,10 @@ _WORDS = {
 
 
 def in_words(error: OSError) -> str:
-    """Without the file's name; as the system says it, if there are no better words."""
+    """Text of an error without the file's name, by default the system's."""
     return _WORDS.get(error.errno or 0) or error.strerror or str(error)
 
 
 def is_known(error: OSError) -> bool:
-    """Whether there are such words."""
+    """Whether the error has a text here."""
     return error.errno in _WORDS

@@ -1,23 +1,23 @@
-"""One clock for a fleet: its ground's, as far as each robot knows it.
+"""The fleet's time: the ground's clock, as estimated by each robot.
 
-Nobody's wall clock is asked: a ground echoes to each robot when, by the robot's own clock, the
-robot said what was heard of it last. What lies between is a round trip, of which the way here took
-some part; so the ground's clock is known to half a round trip, whatever the delays were.
+No wall clock is used. The ground echoes the robot's own time of its last received message. The time
+since then is a round trip, so the ground's clock is known to half a round trip, whatever the
+delays.
 """
 
 import math
 from typing import NamedTuple
 
-# Both clocks' quartzes, s per s.
+# Drift of both clocks' crystals, s per s.
 _DRIFT = 1e-4
-# What is echoed is rounded.
+# Resolution of echoed times.
 _ROUNDED_S = 1e-3
-# Robots change from one ground's clock to another's within a second or so.
+# Grounds kept at the same time: robots change from one to another within about a second.
 _MOST_GROUNDS = 4
 
 
 class FleetTime(NamedTuple):
-    """An instant by the clock of the ground `base`: at most `uncertainty_s` from `time_s`."""
+    """An instant by the clock of the ground `base`, within `uncertainty_s` of `time_s`."""
 
     base: int
     time_s: float
@@ -25,14 +25,14 @@ class FleetTime(NamedTuple):
 
 
 class Age(NamedTuple):
-    """How old something is at least, and at most, s."""
+    """Bounds of an age, s."""
 
     least_s: float
     most_s: float
 
 
 class _Known(NamedTuple):
-    """The ground's clock minus the own one, as it was at `at_s` of the own one."""
+    """The ground's clock minus the own one, at `at_s` of the own one."""
 
     offset_s: float
     uncertainty_s: float
@@ -43,21 +43,21 @@ class _Known(NamedTuple):
 
 
 class FleetClock:
-    """The grounds' clocks by one robot's monotonic clock, which `now_s` is throughout.
+    """The grounds' clocks relative to one robot's monotonic clock, whose time is `now_s`.
 
-    One thread calls `hear`, any number the rest.
+    One thread calls `hear`; the other methods are thread-safe.
     """
 
     def __init__(self) -> None:
-        # Replaced whole; the newest ground is the last.
+        # Replaced as a whole; the newest ground is the last entry.
         self._known: dict[int, _Known] = {}
 
     def hear(
         self, base: int, time_s: float, *, echoed_at_s: float, held_s: float, now_s: float
     ) -> None:
-        """A state came that the ground `base` said at `time_s` of its clock.
+        """Update from a state that the ground `base` sent at `time_s` of its clock.
 
-        `held_s` before that the ground had heard what this robot said at `echoed_at_s`.
+        The ground had received this robot's message of `echoed_at_s` at `held_s` before that.
         """
         round_trip_s = now_s - echoed_at_s - held_s
         if not (round_trip_s >= -_ROUNDED_S and held_s >= 0.0 and math.isfinite(time_s)):
@@ -71,7 +71,7 @@ class FleetClock:
         self._known = dict([*others[1 - _MOST_GROUNDS :], (base, new)])
 
     def at(self, now_s: float) -> FleetTime | None:
-        """That instant by the newest ground's clock; None if no ground has answered yet."""
+        """The instant by the newest ground's clock; None if no ground has answered yet."""
         known = self._known
         if not known:
             return None
@@ -80,7 +80,7 @@ class FleetClock:
         return FleetTime(base, now_s + newest.offset_s, newest.uncertainty_at(now_s))
 
     def age_s(self, instant: FleetTime, now_s: float) -> Age | None:
-        """How long ago the instant was; None if its ground's clock is not known here."""
+        """Age of an instant; None if its ground's clock is unknown."""
         known = self._known.get(instant.base)
         if known is None:
             return None

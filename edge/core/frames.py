@@ -1,8 +1,8 @@
-"""The frames that positions and velocities are given in, and the transforms between them.
+"""Frames of positions and velocities, and the transforms between them.
 
 Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
-Perception-Action-Communication Loops". It prints the rotation as R_z(3 pi/2 - theta) R_x(pi), which
-contradicts its own convention; the convention is what holds here.
+Perception-Action-Communication Loops". Its printed rotation, R_z(3 pi/2 - theta) R_x(pi),
+contradicts its own convention, which is used here.
 
 | frame | axes | origin |
 | --- | --- | --- |
@@ -36,7 +36,7 @@ _Array = TypeVar("_Array", F32, F64)
 def m_per_deg(latitude_deg: float) -> tuple[float, float]:
     """Lengths of a degree to the north and to the east on the WGS84 ellipsoid, m.
 
-    Up to 45 degrees of latitude, a place 100 m away is off by 1 mm, one 1 km away by 0.1 m.
+    Up to 45 degrees of latitude, the error is 1 mm at 100 m and 0.1 m at 1 km.
     """
     semi_major_m, eccentricity_2 = 6378137.0, 6.69437999014e-3
     latitude = math.radians(latitude_deg)
@@ -48,9 +48,9 @@ def m_per_deg(latitude_deg: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class MissionFrame(Bounded):
-    """Where the mission frame lies on the earth: WGS84 degrees, and heading theta in [0, 2 pi).
+    """The mission frame on the earth: WGS84 degrees, and heading theta in [0, 2 pi).
 
-    Raises ValueError if one of them is not finite or out of its range.
+    Raises ValueError if a number is out of range.
     """
 
     latitude_deg: Latitude
@@ -59,13 +59,13 @@ class MissionFrame(Bounded):
 
     @property
     def frame_id(self) -> int:
-        """CRC-32 of the three numbers: positions in frames of different ids do not compare."""
+        """CRC-32 of the three numbers: positions with different ids are not comparable."""
         return zlib.crc32(
             struct.pack("<3d", self.latitude_deg, self.longitude_deg, self.heading_rad)
         )
 
     def to_global_deg(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Latitude and longitude, deg, of a place of the mission frame."""
+        """Latitude and longitude, deg, of a place in the mission frame."""
         sin, cos = math.sin(self.heading_rad), math.cos(self.heading_rad)
         north_m, east_m = cos * y_m - sin * x_m, sin * y_m + cos * x_m
         place = Geodesic.WGS84.Direct(
@@ -82,17 +82,17 @@ class MissionFrame(Bounded):
         local_origin_longitude_deg: float,
         local_origin_altitude_m: float = 0.0,
     ) -> "LocalTransform":
-        """The transform for one local origin, which is good until that origin jumps.
+        """The transform for a local origin, valid until that origin jumps.
 
-        Mission z counts from where the origin's altitude does: so heights, too, stay what they are
-        when it jumps.
+        Mission z has the same zero as the origin's altitude, so heights stay the same when it
+        jumps.
 
-        R = [[-sin theta, cos theta, 0], [cos theta, sin theta, 0], [0, 0, -1]], and the geodesic of
-        length d and azimuth alpha leads from the mission origin to the local one. North at the two
-        origins is taken to be the same direction. That costs d^2 tan(latitude) / 6371 km: 1.6 mm
-        at d = 100 m and 45 degrees.
+        R = [[-sin theta, cos theta, 0], [cos theta, sin theta, 0], [0, 0, -1]]; the geodesic of
+        length d and azimuth alpha leads from the mission origin to the local one. North is taken to
+        be the same direction at both origins, an error of d^2 tan(latitude) / 6371 km: 1.6 mm at d
+        = 100 m and 45 degrees.
 
-        Raises ValueError if the local origin is not finite or out of range.
+        Raises ValueError if the local origin is out of range.
         """
         require(Latitude, local_origin_latitude_deg, "local_origin_latitude_deg")
         require(Longitude, local_origin_longitude_deg, "local_origin_longitude_deg")
@@ -117,10 +117,10 @@ class MissionFrame(Bounded):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalTransform:
-    """Between one local frame and the mission frame; `MissionFrame.relative_to` makes it.
+    """Transform between a local frame and the mission frame; see `MissionFrame.relative_to`.
 
-    `rotation` is R, (3, 3), its own inverse. `local_origin_m` is (3,), in the mission frame.
-    Every method takes and returns (3,) float64.
+    `rotation` (3, 3) is R, its own inverse. `local_origin_m` (3,) is in the mission frame. All
+    methods take and return (3,) float64.
     """
 
     rotation: F64
@@ -143,17 +143,17 @@ class LocalTransform:
         return self._turned(velocity_mission_m_s)
 
     def _turned(self, vector: F64) -> F64:
-        # `@` takes twice as long for so few numbers.
+        # `@` takes twice as long for such small arrays.
         turned: F64 = self.rotation.dot(vector)
         return turned
 
 
 @dataclass(frozen=True, slots=True)
 class ModelScale(Bounded):
-    """Between the mission frame and the units that the policy was trained in.
+    """Scales between the mission frame and the policy's model units.
 
     `env_scale` is in model units per m; `velocity_scale` is in m/s per model velocity. They are
-    independent of each other. Arrays may have any shape, and keep their dtype.
+    independent. Arrays may have any shape, and keep their dtype.
 
     Raises ValueError if a scale is not finite and above 0.
     """
@@ -162,17 +162,17 @@ class ModelScale(Bounded):
     velocity_scale: Positive
 
     def position_to_model(self, position_mission_m: _Array) -> _Array:
-        """Mission position, m, in model units."""
+        """Mission position, m, to model units."""
         return position_mission_m * self.env_scale
 
     def position_to_mission_m(self, position_model: _Array) -> _Array:
-        """Model position in m of the mission frame."""
+        """Model position to m in the mission frame."""
         return position_model / self.env_scale
 
     def velocity_to_mission_m_s(self, velocity_model: _Array) -> _Array:
-        """The policy's velocity as the one to fly, m/s in the mission frame."""
+        """The policy's velocity to m/s in the mission frame."""
         return velocity_model * self.velocity_scale
 
     def velocity_to_model(self, velocity_mission_m_s: _Array) -> _Array:
-        """Mission velocity, m/s, as the policy's."""
+        """Mission velocity, m/s, to the policy's units."""
         return velocity_mission_m_s / self.velocity_scale

@@ -1,7 +1,7 @@
-"""The logger of robot and ground: structlog, which goes where the program says.
+"""Logger of robot and ground, by structlog; the program chooses its output.
 
-Until it says so (`edge.drivers.logs.log_to` for a robot), warnings and errors go to standard error,
-in words. An exception is handed over as `exc_info`.
+By default (before `edge.drivers.logs.log_to` of a robot) warnings and errors go to standard error
+as text. Pass an exception as `exc_info`.
 """
 
 import sys
@@ -9,7 +9,7 @@ from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager
 from typing import Any, Literal
 
-# structlog imports rich for tracebacks in colour, only because it is there: 4 MB in each robot.
+# structlog imports rich if it is installed, for coloured tracebacks: 4 MB in each robot.
 _HIDDEN = {"rich"} - sys.modules.keys()
 sys.modules.update(dict.fromkeys(_HIDDEN))  # type: ignore[arg-type]
 import structlog  # noqa: E402
@@ -21,7 +21,7 @@ log: structlog.typing.FilteringBoundLogger = structlog.get_logger()
 
 
 def show(least: Literal["warning", "error"]) -> None:
-    """Send lines of at least that level to standard error, in words, and no others anywhere."""
+    """Send lines of at least this level to standard error as text; drop all others."""
     structlog.configure(
         [_in_words],
         structlog.make_filtering_bound_logger(least),
@@ -31,7 +31,7 @@ def show(least: Literal["warning", "error"]) -> None:
 
 @contextmanager
 def errors_only() -> Iterator[None]:
-    """Pass over all lines but errors for as long as this context is open."""
+    """Drop all lines except errors within this context."""
     before = structlog.get_config()["wrapper_class"]
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger("error"))
     try:

@@ -1,4 +1,4 @@
-"""A robot's memory of the world, from its sensor and from what others tell.
+"""A robot's map of the world, from its sensor and from others' shared maps.
 
 All maps are indexed [x, y]; one cell is one model unit; positions are in model units.
 """
@@ -12,25 +12,25 @@ from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters, window_corner
 from edge.core.shared_map import SharedCells, SharedMap
 
-# What a robot has explored is told in this many cells along each side of the world.
+# Cells along each side of the world in the coarse raster of explored areas.
 EXPLORED_CELLS = 64
 TILE_SIZE = 128
 
 
 class RobotMap:
-    """Map of the cells that one robot has seen, in tiles that are made when first seen.
+    """Map of the cells that one robot has seen, in tiles that are allocated when first seen.
 
-    So its cost is that of the area seen, however large the world is.
+    Memory and time depend on the seen area, not on the world's size.
     """
 
     def __init__(self, world_size: int, unseen: float = 0.0) -> None:
-        """`unseen` is the value of cells that were not seen; it may be NaN."""
+        """`unseen` is the value of unseen cells, possibly NaN."""
         self._world_size = world_size
         self._unseen = np.float32(unseen)
         self._tiles: dict[tuple[int, int], F32] = {}
 
     def insert(self, view: F32, corner: tuple[int, int], seen: Bools | None = None) -> None:
-        """Write the square `view`, whose lowest cell is `corner`; what is off the world is not.
+        """Write the square `view` with the lowest cell `corner`, clipped to the world.
 
         With `seen`, of the view's shape, only where it is True.
         """
@@ -46,7 +46,7 @@ class RobotMap:
                 np.copyto(tile[tile_part], view[view_part], where=seen[view_part])
 
     def window(self, corner: tuple[int, int], out: F32) -> F32:
-        """Fill the square `out` from `corner` on and return it; the outside of the world is 0."""
+        """Fill the square `out` from `corner` on and return it; 0 outside the world."""
         size = out.shape[0]
         if min(corner) < 0 or max(corner) + size > self._world_size:
             out[:] = 0.0
@@ -58,14 +58,14 @@ class RobotMap:
     def _overlaps(
         self, corner: tuple[int, int], size: int
     ) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
-        """Tile, part of the tile and part of the window, for all tiles that share cells."""
+        """Yield each tile that shares cells, with the parts of tile and window."""
         spans_y = list(self._spans(corner[1], size))
         for tile_x, in_tile_x, in_window_x in self._spans(corner[0], size):
             for tile_y, in_tile_y, in_window_y in spans_y:
                 yield (tile_x, tile_y), (in_tile_x, in_tile_y), (in_window_x, in_window_y)
 
     def _spans(self, start: int, size: int) -> Iterator[tuple[int, slice, slice]]:
-        """The same along one axis, from `start` on and inside the world."""
+        """The same along one axis, clipped to the world."""
         low, end = max(start, 0), min(start + size, self._world_size)
         while low < end:
             tile = low // TILE_SIZE
@@ -85,17 +85,17 @@ class RobotMemory:
         self._world_size = parameters.world_size
         self._unseen = parameters.unseen
         self._cells = SharedCells(parameters) if parameters.shared_map_cell else None
-        # What others tell goes where there is nothing.
+        # Others' maps fill the gaps, so these must be NaN.
         self._map = RobotMap(parameters.world_size, math.nan if self._cells else self._unseen)
         self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
-        # For people: which cells of the coarse raster over the world it has seen.
+        # For display: seen cells of a coarse raster over the world.
         self.explored: Bools = np.zeros((EXPLORED_CELLS,) * 2, np.bool_)
 
     def observe(self, position: F64, view: F32, seen: Bools | None = None) -> None:
         """Write the sensor's view (sensor_size, sensor_size) around `position` into the map.
 
-        With `seen`, of the same shape, only where it is True. Those cells of `explored` count as
-        seen whose centre was.
+        With `seen`, of the same shape, only where it is True. Cells of `explored` count as seen
+        with their centre.
         """
         size = view.shape[0]
         corner = window_corner(position, size)
@@ -117,7 +117,7 @@ class RobotMemory:
             self.explored[x, y] |= seen[np.ix_(in_x, in_y)]
 
     def hear(self, told: SharedMap) -> None:
-        """Remember what another robot knows; nothing, if maps are not shared."""
+        """Merge another robot's shared map, if maps are shared."""
         if self._cells:
             self._cells.hear(told)
 
@@ -126,10 +126,9 @@ class RobotMemory:
         return self._cells.tell(position) if self._cells else None
 
     def local_map(self, position: F64) -> F32:
-        """(local_map_size, local_map_size) around `position`, valid until the next call.
+        """Map (local_map_size, local_map_size) around `position`, valid until the next call.
 
-        `PerceptionParameters.unseen` where nothing was seen, nor told by others; the outside of the
-        world is 0.
+        `PerceptionParameters.unseen` in unknown cells; 0 outside the world.
         """
         corner = window_corner(position, self._local.shape[0])
         self._map.window(corner, self._local)

@@ -1,4 +1,4 @@
-"""Errors and results of code of another package, in one line that its author can act on."""
+"""Errors and results of another package's code, as one line for its author."""
 
 import traceback
 
@@ -6,11 +6,11 @@ import numpy as np
 
 
 class PartError(ValueError):
-    """A part of the robot, such as its policy or its sensor, failed; the text is for a person."""
+    """A part of the robot, such as its policy or sensor, failed; the text is for people."""
 
 
 def in_one_line(error: Exception) -> str:
-    """Describe what was raised, and the line of the package's own code that led to it.
+    """Describe an exception, and the line of the package's own code that led to it.
 
     A PartError has its text already.
     """
@@ -21,7 +21,7 @@ def in_one_line(error: Exception) -> str:
         (*frame.f_code.co_filename.rpartition("/")[::2], line)
         for frame, line in traceback.walk_tb(error.__traceback__)
     ]
-    # The first is of who called it. What it calls itself, such as numpy, tells its author less.
+    # The first place is the caller. Code below the package, such as numpy, says less to its author.
     called = places[1:]
     if not called:
         return text
@@ -31,7 +31,7 @@ def in_one_line(error: Exception) -> str:
 
 
 def array_problem(name: str, values: object, shape: tuple[int, ...]) -> str:
-    """Why a part's array is not used; "" if it has that shape and is finite."""
+    """Why a part's array is invalid; "" if it has the shape and is finite."""
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub":
         what = f"{values.dtype}s" if isinstance(values, np.ndarray) else type(values).__name__
         return f"{name} is of type {what}: must be a numpy array of floats, of shape {shape}"

@@ -1,4 +1,4 @@
-"""The outside world as the robot sees it; drivers and the simulator implement these."""
+"""Interfaces to the outside world, implemented by drivers and simulators."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -10,36 +10,35 @@ from edge.core.vehicle import Action, Setpoint, VehicleState
 
 
 class Clock(Protocol):
-    """Return the time. Called from any thread."""
+    """Source of time, thread-safe."""
 
     def monotonic_s(self) -> float:
-        """Time that never jumps, s; by it all ages are told."""
+        """Time that never jumps, s, for all ages."""
 
     def unix_s(self) -> float:
-        """The wall clock, s; it may be wrong, and may be set."""
+        """Wall clock, s, which may be wrong or be set."""
 
 
 class Sensor(Protocol):
-    """Looks at the importance of the ground below the robot, and sees all that the policy asks for.
+    """Sees the importance of the ground in the policy's whole sensor area.
 
-    A sensor that sees less, or another part from another height, is a `Camera`.
+    A sensor that sees less, or depends on the height, is a `Camera`.
     """
 
     def view(self, position: F64) -> F32 | None:
-        """The importance around the robot, or None when there is no fresh reading.
+        """The importance around the robot, or None without a fresh reading.
 
-        Called from the perception thread alone.
-
-        (sensor_size, sensor_size), indexed [x, y] along the mission axes, centred as
-        `perception.window_corner` says. `position` (2,) is the robot's, in model units: where the
-        view will be written into the map; a sensor that physically looks down does not need it.
+        Called from the perception thread only. The result is (sensor_size, sensor_size), indexed
+        [x, y] along the mission axes, centred as in `perception.window_corner`. `position` (2,) is
+        the robot's, in model units, where the view goes into the map; a sensor that physically
+        looks down does not need it.
         """
 
 
 class Look(NamedTuple):
-    """A camera's view: both (sensor_size, sensor_size), indexed and centred as `Sensor.view` is.
+    """A camera's view: both (sensor_size, sensor_size), indexed and centred like `Sensor.view`.
 
-    `importance` is finite, also where `seen` is False; there it is not used.
+    `importance` must be finite also where `seen` is False, where it is ignored.
     """
 
     importance: F32
@@ -48,29 +47,27 @@ class Look(NamedTuple):
 
 @runtime_checkable
 class Camera(Protocol):
-    """Looks at the ground from the robot's height, and says which part of it it saw."""
+    """Sees the ground from the robot's height, and reports which part it saw."""
 
     def look(self, position: F64, height: float) -> Look | None:
-        """Return the newest view, or None when there is no fresh reading.
+        """The newest view, or None without a fresh reading.
 
-        Called from the perception thread alone.
-
-        `position` (2,) is the robot's, and `height` above its own takeoff point, both in model
-        units. A look that saw nothing, as from the ground, is one all the same; without any the
-        robot would not be ready to take off.
+        Called from the perception thread only. `position` (2,) is the robot's, `height` is above
+        its own takeoff point, both in model units. Return a look even if nothing was seen, for
+        example on the ground: without any, the robot is not ready to take off.
         """
 
 
-# Makes a sensor. It is called with the text of a world file and the name by which a ValueError
-# should call that file if it cannot be used. A sensor that looks at the real world needs neither.
+# Makes a sensor from the text of a world file and the file's name for a ValueError. A sensor of the
+# real world needs neither.
 SensorOver = Callable[[str, str], Sensor | Camera]
 
 
 class SensorSetting(NamedTuple):
-    """Requirements of a sensor: views of `perception.sensor_size`, as the policy was trained.
+    """Requirements of a sensor: views of `perception.sensor_size`, as in the policy's training.
 
-    `idf_truncation` (standard deviations) and `idf_norm` (the importance of the most important
-    cell) are those of a world that is computed. `options` are what robot.toml says of the sensor.
+    `idf_truncation` (standard deviations) and `idf_norm` (the largest importance) are those of a
+    computed world. `options` are the sensor's in robot.toml.
     """
 
     perception: PerceptionParameters
@@ -80,100 +77,96 @@ class SensorSetting(NamedTuple):
 
 
 class SensorDriver(Protocol):
-    """A type of sensor. What it opens is closed when the robot's program ends."""
+    """Type of sensor. Its context is closed when the robot's program ends."""
 
     def __call__(self, setting: SensorSetting) -> AbstractContextManager[SensorOver]:
-        """Entering it gives a `SensorOver`, a callable that makes the sensor.
+        """Enter it for a `SensorOver`, a callable that makes the sensor.
 
-        It is called with the text of a world file and the name by which a ValueError should call
-        that file if it cannot be used. A sensor that looks at the real world needs neither. A
-        sensor is told where the robot is, and nothing of its heading, its speed or which robot it
-        is.
+        The callable gets the text of a world file, and the file's name for a ValueError. A sensor
+        of the real world needs neither. Sensors know the robot's position, not its heading, speed
+        or id.
 
         Raises ValueError or OSError, one line, for a sensor that cannot be used.
         """
 
 
 class Odometry(NamedTuple):
-    """Where the robot is and how it moves: the mission frame, m and m/s."""
+    """The robot's position and velocity in the mission frame, m and m/s."""
 
     position_m: tuple[float, float, float]
     velocity_m_s: tuple[float, float, float]
 
 
 class OdometrySource(Protocol):
-    """Knows where the robot is."""
+    """Source of the robot's position."""
 
     def odometry(self) -> Odometry | None:
-        """The newest estimate, or None when it is not known.
-
-        Called from several threads at once.
-        """
+        """The newest estimate, or None if unknown. Thread-safe."""
 
 
 class Vehicle(Protocol):
-    """The vehicle. No method waits for it, and none raises."""
+    """The vehicle. No method waits or raises."""
 
     def state(self) -> VehicleState:
-        """The newest of everything. Called from any thread."""
+        """The newest state. Thread-safe."""
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
-        """Send it, a `Velocity` or a `Position`, once; what was really sent, None if nothing was.
+        """Send a `Velocity` or a `Position` once; returns the setpoint as sent, None if none was.
 
-        Nothing sends it again: when the calls stop, the autopilot's own failsafe sees the silence.
-        Called from the control thread alone.
+        Setpoints are not repeated: when the calls stop, the autopilot's own failsafe acts. Called
+        from the control thread only.
         """
 
     def command(self, action: Action) -> None:
-        """Ask for `action`; the outcome comes as `VehicleState.result`. Called from any thread.
+        """Request `action`; its outcome is `VehicleState.result`. Thread-safe.
 
-        Commands are carried out one after another; KILL goes before all others.
+        Commands are executed in order, except KILL, which goes first.
         """
 
 
 class VehicleSetup(Protocol):
-    """Vehicle setup for a flight. Each method waits for the vehicle, and may raise OSError.
+    """Vehicle setup for a flight. Methods wait for the vehicle, and may raise OSError.
 
-    Called from one thread alone, preflight's, every two seconds: on the ground, where what is wrong
-    is set, and in flight, where somebody else may change it.
+    Called from the preflight thread only, every two seconds: on the ground to correct settings, and
+    in flight, since others may change them.
     """
 
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
-        """PX4's parameters, of which `lpac robot check` says what they must be.
+        """Read PX4's parameters, those that `lpac robot check` lists.
 
-        None for one that PX4 does not have, which is refused: a vehicle that is no PX4 answers 0 at
-        first, keeps what is set, and has to do what the parameters promise.
+        None for a parameter unknown to PX4, which is refused. A vehicle that is not a PX4 first
+        answers 0, keeps values that are set, and must behave as the parameters promise.
         """
 
     def set_parameter(self, name: str, value: int | float) -> None:
-        """Set one."""
+        """Set one parameter."""
 
     def upload_fence(self, vertices_deg: Sequence[tuple[float, float]]) -> None:
-        """Replace PX4's fence by one polygon to stay in: latitude and longitude."""
+        """Replace PX4's fence by one inclusion polygon: latitude and longitude."""
 
     def has_fence(self) -> bool:
-        """Whether the vehicle still has the fence that was uploaded last; False if none was."""
+        """Whether the vehicle still has the last uploaded fence; False if there was none."""
 
 
 class Watchdog(Protocol):
-    """Holds the vehicle when the control loop hangs."""
+    """Makes the vehicle hold if the control loop hangs."""
 
     def feed(self, *, flying: bool) -> None:
-        """The control loop lives, and flies the vehicle or not. The control thread's."""
+        """Report that the control loop runs, and whether it flies. Control thread only."""
 
     def alive(self) -> bool:
-        """Whether it watches. Called from any thread."""
+        """Whether the watchdog works. Thread-safe."""
 
 
 class Recorder(Protocol):
-    """The flight log."""
+    """The flight log, thread-safe."""
 
     def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
-        """Keep one message: plain values, bytes and numpy arrays. Never waits; any thread."""
+        """Store one message of plain values, bytes and numpy arrays. Never waits."""
 
     @property
     def recording(self) -> bool:
-        """Whether what is recorded is kept. Any thread."""
+        """Whether messages are stored."""
 
 
 class VehicleSetting(NamedTuple):
@@ -185,10 +178,10 @@ class VehicleSetting(NamedTuple):
 
 
 class OpenVehicle(NamedTuple):
-    """A vehicle that is there, or that is waited for.
+    """A vehicle, connected or not.
 
-    `watchdog` makes one that holds the vehicle so many s after the control loop fell silent, and
-    lands it so many s later.
+    `watchdog(hold_after_s, land_after_s)` makes one that makes the vehicle hold when the control
+    loop has been silent for the first time, and land after the second time more.
     """
 
     vehicle: Vehicle
@@ -197,10 +190,10 @@ class OpenVehicle(NamedTuple):
 
 
 class VehicleDriver(Protocol):
-    """A type of vehicle. It is closed when the robot's program ends."""
+    """Type of vehicle. Its context is closed when the robot's program ends."""
 
     def __call__(self, setting: VehicleSetting) -> AbstractContextManager[OpenVehicle]:
-        """Raises ValueError or OSError, one line, also if another program of this machine has it.
+        """Raises ValueError or OSError, one line, also if another program of this machine uses it.
 
-        A vehicle that is not there yet is no error.
+        A vehicle that is not connected yet is no error.
         """

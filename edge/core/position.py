@@ -1,10 +1,10 @@
-"""Whether the robot may trust its position: one judgement for preflight, flight and status.
+"""Judges whether to trust the position: one judgement for preflight, flight and status.
 
-What is heard of the vehicle -> what speaks against its position (`PositionCause`) ->
-`PositionQuality`, with hysteresis: one glitch must not land a drone, and nothing may be flown
-blind. Nothing here has a clock.
+Vehicle state -> causes of distrust (`PositionCause`) -> `PositionQuality`, with hysteresis: a
+single glitch must not land a drone, and a bad position must not be flown. No clock is used.
 
-What one receiver cannot notice, such as a bias that walks, is margin: see docs/safety.md.
+Errors that one receiver cannot notice, such as a drifting bias, are part of the margins: see
+docs/safety.md.
 """
 
 import math
@@ -19,35 +19,35 @@ from edge.core.schema import Bounded, Positive
 from edge.core.vehicle import Gps, VehicleState
 
 _FIX_3D = 3
-# Asked for at 5 and 20 Hz. An autopilot may keep sending what its estimator made up long before, so
-# that silence is only one way to lose a position.
+# Requested at 5 and 20 Hz. An autopilot may continue to send its estimate without measurements, so
+# silence is only one way to lose a position.
 _GPS_SILENT_S = 1.5
 _POSITION_OLD_S = 0.6
-# An estimate of a vehicle's sensors is never twice the same.
+# An estimate from a vehicle's sensors never repeats exactly.
 _FROZEN_S = 1.0
-# Nor is what a receiver measures, which has noise even at rest: three repeats are no coincidence.
+# A receiver's measurements have noise even at rest: three repeats are no coincidence.
 _STUCK_REPEATS = 3
-# A receiver's velocity errs by some 0.3 m/s, an estimate's by up to 0.9 m/s.
+# A receiver's velocity error is about 0.3 m/s, an estimate's up to 0.9 m/s.
 _MAX_VELOCITY_OFFSET_M_S = 2.0
-# Where they are apart and the fix's places say so much of it, the receiver's velocity is the wrong
-# one: PX4's estimator would take it over within a second.
+# If they differ and the fix's places slip by this much, the receiver's velocity is the wrong one:
+# PX4's estimator would adopt it within a second.
 _SLIP_BESIDE_VELOCITY_M = 1.0
-# Asked for at 5 Hz, sent once a second by itself; what is older says nothing about now.
+# Requested at 5 Hz, sent once a second by default; older ones say nothing about the present.
 _ESTIMATOR_HEARD_S = 2.5
-# As long as a jump counts as one: longer than any `doubtful_after_s` that makes sense.
+# Duration of a jump: longer than any sensible `doubtful_after_s`.
 _JUMP_S = 1.0
-# Whoever did not look for so long begins anew to count.
+# After a longer pause of the judge, all durations start again.
 _NOT_LOOKED_S = 0.5
-# What comes and goes faster is bad all along.
+# A shorter good time does not interrupt a bad one.
 _CLEAR_S = 0.5
-# A receiver that contradicts itself is not believed again before it was consistent for so long.
+# Time of consistency after which a receiver that contradicted itself is believed again.
 _BELIEVED_AFTER_S = 1.0
-# An accuracy so much worse than allowed is no position.
+# An accuracy worse than allowed by this factor counts as no position.
 _HOPELESS = 2.0
 
 
 class PositionQuality(StrEnum):
-    """GOOD: fly by it. DOUBTFUL: stay where you are. LOST: land."""
+    """GOOD: fly by it. DOUBTFUL: stay in place. LOST: land."""
 
     GOOD = "good"
     DOUBTFUL = "doubtful"
@@ -55,9 +55,9 @@ class PositionQuality(StrEnum):
 
 
 class PositionCause(StrEnum):
-    """Causes of distrust in a position, the gravest first.
+    """Causes of distrust in a position, the most severe first.
 
-    What a newer program says, and this one has no name for, is UNKNOWN.
+    Unknown causes from newer programs are UNKNOWN.
     """
 
     UNKNOWN = "unknown"
@@ -102,15 +102,15 @@ _WORDS = {
 
 @dataclass(frozen=True, slots=True)
 class PositionLimits(Bounded):
-    """How good is good enough in flight, and for how long it must not be.
+    """Requirements of the position in flight, and times until they act.
 
-    `max_accuracy_m` is the receiver's own figure; `max_offset_m` is the distance of its fix from
-    the estimate, and how far it may move in 10 s in another way than its own velocity says. A
-    position is doubtful once something spoke against it for `doubtful_after_s`, never silent for
-    0.5 s; lost once there was none for `lost_after_s`, or it stayed doubtful for
-    `doubtful_lost_after_s`; and good again once nothing spoke against it for `good_after_s`.
+    `max_accuracy_m` bounds the receiver's own figure; `max_offset_m` bounds the distance of its fix
+    from the estimate, and the difference in 10 s between its movement and its own velocity. A
+    position becomes doubtful after `doubtful_after_s` with causes of distrust, never interrupted
+    for 0.5 s; lost after `lost_after_s` without position, or `doubtful_lost_after_s` in doubt; and
+    good again after `good_after_s` without cause.
 
-    Raises ValueError if a number is not finite or out of its range.
+    Raises ValueError if a number is out of range.
     """
 
     min_satellites: Annotated[int, Meta(ge=4)] = 6
@@ -132,13 +132,13 @@ class PositionLimits(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class PositionJudgement:
-    """Trust in the position, since `since_s`; `cause` is what speaks against it now, or spoke.
+    """Trust in the position, since `since_s`; `cause` is the present or last cause of distrust.
 
-    `value` is what was measured where the cause has a number. `contradicted_at_s` is when the
-    receiver last contradicted itself: an estimator that believes it is led astray within seconds,
-    and better off without it. From `bad_since_s` on something
-    spoke against it, never silent for 0.5 s; from `none_since_s` on there was no position, from
-    `good_since_s` on nothing spoke against it; None if it is not so now.
+    `value` is the measured value of a cause with a number. `contradicted_at_s` is when the receiver
+    last contradicted itself: an estimator that uses it is led astray within seconds, and is better
+    off without it. Distrust began at `bad_since_s`, never interrupted for 0.5 s; the position is
+    missing since `none_since_s`, and without causes of distrust since `good_since_s`; None if not
+    so now.
     """
 
     quality: PositionQuality = PositionQuality.LOST
@@ -154,12 +154,12 @@ class PositionJudgement:
 
     @property
     def text(self) -> str:
-        """For people: why the position is not good; "" if it is."""
+        """Text for people why the position is not good; "" if it is."""
         return "" if self.cause is None else _WORDS[self.cause].format(value=self.value)
 
     @property
     def distrusts_gps(self) -> bool:
-        """Whether the receiver contradicts itself, or did so a moment ago."""
+        """Whether the receiver contradicts itself, or did a moment ago."""
         return self.looked_at_s - self.contradicted_at_s < _BELIEVED_AFTER_S
 
 
@@ -173,10 +173,10 @@ class _Finding(NamedTuple):
 def judge(
     before: PositionJudgement, vehicle: VehicleState, limits: PositionLimits, now_s: float
 ) -> PositionJudgement:
-    """Judge the position now. To be called a few times a second."""
+    """Judge the position now. Call it a few times a second."""
     looked_from_s = before.looked_from_s
     if not now_s - before.looked_at_s <= _NOT_LOOKED_S:
-        # Nobody knows what was in between: all counts from now on.
+        # The time in between is unknown: start all durations again.
         looked_from_s = now_s
         before = replace(before, bad_since_s=None, none_since_s=None, good_since_s=None)
     found = _findings(vehicle, limits, now_s)
@@ -232,11 +232,11 @@ def _since(
 
 
 def _findings(vehicle: VehicleState, limits: PositionLimits, now_s: float) -> Iterator[_Finding]:
-    """All that speaks against the position now."""
+    """Yield all present causes of distrust."""
     if vehicle.position_local_m is None or vehicle.origin is None:
         yield _Finding(PositionCause.UNKNOWN, True, now_s)
     elif now_s - vehicle.position_at_s > _POSITION_OLD_S:
-        # Nothing is known of the vehicle since: that counts from the last word of it.
+        # The vehicle's state is unknown since the last message, so count from there.
         yield _Finding(PositionCause.OLD, True, vehicle.position_at_s)
     elif now_s - vehicle.position_changed_at_s > _FROZEN_S:
         yield _Finding(PositionCause.FROZEN, True, vehicle.position_changed_at_s + _FROZEN_S)
@@ -255,7 +255,7 @@ def _findings_of_receiver(
     gps: Gps | None, limits: PositionLimits, now_s: float
 ) -> Iterator[_Finding]:
     if gps is None or now_s - gps.at_s > _GPS_SILENT_S:
-        # From when it was noticed: a pause of the receiver must not land a drone at once.
+        # Counted from when it is noticed: a pause of the receiver must not land a drone at once.
         yield _Finding(
             PositionCause.GPS_SILENT, True, now_s if gps is None else gps.at_s + _GPS_SILENT_S
         )

@@ -1,11 +1,11 @@
-"""Which PX4 versions this program is made for, and how far each of them was tried.
+"""Supported PX4 versions, and how far each was tested.
 
-docs/px4.md lists what it relies on in them.
+docs/px4.md lists the features that are relied on.
 """
 
 OLDEST = (1, 14)
 
-# What was done with a version. "Read" is that all of what is relied on was read in its sources.
+# Evidence for each version. "Read" means that all features relied on were checked in its sources.
 EVIDENCE = {
     (1, 14): "tested: PX4 SITL 1.14.4",
     (1, 15): "read in its sources, never tried",
@@ -15,7 +15,7 @@ EVIDENCE = {
 
 
 def in_words(version: str | None) -> str:
-    """A vehicle's version, such as "1.17.0", and how far it was tried."""
+    """Text of a vehicle's version, such as "1.17.0", and how far it was tested."""
     if version is None:
         return "PX4 did not tell its version"
     number = _number(version)
@@ -25,7 +25,7 @@ def in_words(version: str | None) -> str:
 
 
 def is_too_old(version: str | None) -> bool:
-    """Whether it is known to lack what this program relies on."""
+    """Whether the version is known to lack required features."""
     return version is not None and _number(version) < OLDEST
 
 

@@ -1,7 +1,7 @@
-"""Declared bounds: mappings (TOML, JSON) into frozen dataclasses; each mistake is one line.
+"""Declared bounds: converts mappings (TOML, JSON) to frozen dataclasses, with one-line errors.
 
-A field's type says all that it may be: `Annotated[float, Meta(ge=0.0, le=1.0)]` is a `Share`.
-msgspec decodes files and messages by it; `Bounded` checks what Python constructs.
+A field's type declares its bounds: `Annotated[float, Meta(ge=0.0, le=1.0)]` is a `Share`. msgspec
+decodes files and messages by these types; `Bounded` checks values constructed in Python.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from msgspec import Meta
 
 T = TypeVar("T")
 
-# msgspec takes no infinite bound; NaN and infinity lie outside of any.
+# msgspec has no infinite bounds. NaN and infinity are outside of all.
 MAX_FLOAT = sys.float_info.max
 _LONGEST_SHOWN = 200
 
@@ -35,14 +35,14 @@ PointXY = Annotated[tuple[Finite, ...], Meta(min_length=2, max_length=2, descrip
 
 
 class ConfigError(ValueError):
-    """A value that a person wrote is unknown, missing or impossible; the text says which."""
+    """A value in a configuration is unknown, missing or impossible; the text names it."""
 
 
 def from_mapping(cls: type[T], mapping: object, where: str) -> T:
-    """Build the dataclass `cls` from `mapping`; nested dataclasses from nested mappings.
+    """Convert `mapping` to the dataclass `cls`, and nested mappings to nested dataclasses.
 
-    `where` names the file, and then the path of keys, in errors. Field types may be whatever
-    msgspec decodes, with its constraints. Rules between fields are `Bounded.check_rules`, with a
+    `where` names the file, then the path of keys, in errors. Field types may be any that msgspec
+    decodes, with its constraints. Rules between fields are `Bounded.check_rules`, which raises
     ValueError.
 
     Raises ConfigError for an unknown or missing key, a wrong type or an impossible value.
@@ -55,7 +55,7 @@ def from_mapping(cls: type[T], mapping: object, where: str) -> T:
 
 
 def explain(error: msgspec.ValidationError, hint: Any, value: object, where: str) -> str:
-    """Say in one line why msgspec does not convert a value: its innermost wrong part, and why."""
+    """One line why msgspec does not convert a value: its innermost wrong part, and the cause."""
     for part in _parts(hint, value, where):
         try:
             msgspec.convert(part[1], part[0])
@@ -72,9 +72,9 @@ def explain(error: msgspec.ValidationError, hint: Any, value: object, where: str
 
 
 class Bounded:
-    """Base of dataclasses whose values are checked however they are constructed.
+    """Base of dataclasses whose values are checked on construction.
 
-    Raises ValueError in the words of `from_mapping` for a value outside of its declared bounds.
+    Raises ValueError with the text of `from_mapping` for a value out of bounds.
     """
 
     __slots__ = ()
@@ -84,11 +84,11 @@ class Bounded:
         self.check_rules()
 
     def check_rules(self) -> None:
-        """Raise ValueError where values do not go together; each is within its own bounds."""
+        """Raise ValueError for values that do not fit together; each is within its own bounds."""
 
 
 def check_bounds(instance: object) -> None:
-    """Raise ValueError for the first field of a dataclass that is outside of its bounds."""
+    """Raise ValueError for the first field out of bounds."""
     cls: Any = type(instance)
     if not _fits(instance, _part(cls)):
         for fault in _faults(instance, _bounded_fields(cls)).values():
@@ -96,26 +96,26 @@ def check_bounds(instance: object) -> None:
 
 
 def faults(instance: object, names: tuple[str, ...]) -> dict[str, str]:
-    """Those fields of a dataclass that are outside of their bounds, each with what is wrong."""
+    """Fields of a dataclass that are out of bounds, with the reasons."""
     cls: Any = type(instance)
     return {} if _fits(instance, _part(cls, names)) else _faults(instance, names)
 
 
 def require(hint: Any, value: object, where: str) -> None:
-    """Raise ValueError if one value is outside of the bounds of its type."""
+    """Raise ValueError if a value is out of its type's bounds."""
     fault = _fault(hint, value, where)
     if fault is not None:
         raise ValueError(fault)
 
 
 def bounds_of(cls: Any) -> Mapping[str, Meta]:
-    """The constraint of each field of a dataclass that has one, else that of a list's elements."""
+    """Constraint of each field that has one, or of a list's elements."""
     metas = {name: _bounds(hint) for name, hint in _hints(cls).items()}
     return {name: meta for name, meta in metas.items() if meta is not None}
 
 
 def in_words(meta: Meta) -> str:
-    """Describe the values that a constraint allows, to follow "must be"."""
+    """Text of the allowed values, to follow "must be"."""
     if meta.description is not None:
         return meta.description
     least = None if meta.ge == -MAX_FLOAT else meta.ge
@@ -141,14 +141,14 @@ def in_words(meta: Meta) -> str:
 
 
 def no_options(where: str, options: Mapping[str, object]) -> None:
-    """Of a driver that has none. Raises ConfigError that names the first one."""
+    """Check for a driver without options. Raises ConfigError that names the first one."""
     for key in options:
         raise ConfigError(f"{where}: options: unknown key {key!r}; it has none")
 
 
 @functools.cache
 def _hints(cls: Any) -> dict[str, Any]:
-    """The types of a dataclass's fields by name; looking them up is slow."""
+    """Types of a dataclass's fields by name, cached because the look-up is slow."""
     hints = typing.get_type_hints(cls, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
@@ -170,13 +170,13 @@ def _bounded_fields(cls: Any) -> tuple[str, ...]:
 
 @functools.cache
 def _part(cls: Any, names: tuple[str, ...] | None = None) -> Any:
-    """A type of those fields alone, or of all that are bounded, by which msgspec checks."""
+    """A type of the named fields, by default all bounded ones, with which msgspec checks."""
     chosen = _bounded_fields(cls) if names is None else names
     return msgspec.defstruct(cls.__name__, [(name, _hints(cls)[name]) for name in chosen])
 
 
 def _fits(instance: object, part: Any) -> bool:
-    """Whether msgspec takes it; it does not take numpy's numbers, which may be within bounds."""
+    """Whether msgspec accepts it; it refuses numpy's numbers, even within bounds."""
     try:
         msgspec.convert(instance, part, from_attributes=True)
     except msgspec.ValidationError:
@@ -197,12 +197,12 @@ def _is_bounded(hint: Any) -> bool:
     return bool(metas) or is_choice or any(map(_is_bounded, typing.get_args(kind)))
 
 
-# numpy's numbers too.
+# Includes numpy's numbers.
 _OF_TYPE: dict[Any, type] = {int: Integral, float: Real, str: str}
 
 
 class _Parsed(NamedTuple):
-    """A field's type without None and constraints, its constraints, whether it may be None."""
+    """A field's type without None and constraints, its constraints, whether None is allowed."""
 
     kind: Any
     metas: tuple[Meta, ...]
@@ -226,7 +226,7 @@ def _parse(hint: Any) -> _Parsed:
 
 
 def _parts(hint: Any, value: object, where: str) -> Iterator[tuple[Any, Any, str]]:
-    """Typed parts of a table or list: the type, the value, and where it is."""
+    """Yield the typed parts of a table or list: type, value and path."""
     kind = _parse(hint).kind
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if isinstance(value, Mapping):
@@ -245,7 +245,7 @@ def _parts(hint: Any, value: object, where: str) -> Iterator[tuple[Any, Any, str
 
 
 def _fault(hint: Any, value: Any, where: str) -> str | None:
-    """Describe, as one line, where a value of the right type is out of its bounds."""
+    """One line why a value of the right type is out of bounds; None if it is not."""
     kind, metas, optional = _parse(hint)
     if value is None and optional:
         return None
@@ -285,7 +285,7 @@ def _require_known_keys(hint: Any, value: object, where: str) -> None:
 
 
 def _not_of(kind: Any, value: object) -> str:
-    """Why a value is not of a type, to follow its key."""
+    """Text why a value does not have a type, to follow its key."""
     if _is_table(kind):
         if not isinstance(value, Mapping):
             return f": expected a table, got {_shown(value)}"

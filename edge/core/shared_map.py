@@ -1,11 +1,10 @@
-"""Maps that robots share: a coarse map of the surroundings of the robot that tells it.
+"""Shared maps: a coarse map of the sender's surroundings.
 
-Its cells are squares of `PerceptionParameters.shared_map_cell` model units, from the world's corner
-on. A robot knows a cell once its sensor has shown all of it at once, or once it was told. What it
-was told it passes on: so news travels as far as the communication graph reaches, now or later, and
-a message is as large in any swarm. A cell is a byte: 0 if it is unknown, else one more than the
-exponent and the first three bits of the fraction of a float16, so that who passes it on tells the
-same.
+Cells are squares of `PerceptionParameters.shared_map_cell` model units from the world's corner on.
+A robot knows a cell once its sensor has seen all of it at once, or another robot sent it. Robots
+forward received cells, so knowledge spreads as far as the communication graph reaches at any time,
+with messages of constant size. A cell is one byte: 0 if unknown, else one more than the exponent
+and the first three fraction bits of a float16, so forwarding changes nothing.
 
 All maps are indexed [x, y].
 """
@@ -22,7 +21,7 @@ Codes = npt.NDArray[np.uint8]
 
 _SHIFT = 7
 _MOST_CODE = 0xF8
-# Of each byte, (256,): NaN of 0, and of those that stand for nothing.
+# Value of each byte, (256,): NaN for 0 and unused bytes.
 _IMPORTANCE = np.full(256, np.nan, np.float32)
 _IMPORTANCE[1 : _MOST_CODE + 1] = (np.arange(_MOST_CODE, dtype=np.uint16) << _SHIFT).view(
     np.float16
@@ -31,14 +30,14 @@ _LARGEST = _IMPORTANCE[_MOST_CODE]
 
 
 class SharedMap(NamedTuple):
-    """A robot's known surroundings: `codes` (n, n), which nobody changes, from cell `corner` on."""
+    """A robot's known surroundings: read-only `codes` (n, n) from cell `corner` on."""
 
     corner: tuple[int, int]
     codes: Codes
 
 
 def codes_of(importance: F32) -> Codes:
-    """The bytes for importance of any shape, which is finite: to the nearest, from 0 to 61440."""
+    """Nearest bytes for finite importance of any shape, from 0 to 61440."""
     bounded: F32 = np.minimum(np.maximum(importance, 0.0), _LARGEST)
     bits = bounded.astype(np.float16).view(np.uint16)
     codes: Codes = (((bits + (1 << (_SHIFT - 1))) >> _SHIFT) + 1).astype(np.uint8)
@@ -46,36 +45,36 @@ def codes_of(importance: F32) -> Codes:
 
 
 def importance_of(codes: Codes) -> F32:
-    """The importance that bytes stand for, NaN where it is unknown."""
+    """Importance of bytes; NaN where unknown."""
     return _IMPORTANCE[codes]
 
 
 def cell_means(view: F32, cell: int) -> F32:
-    """(m, n): the mean of each square of `cell` x `cell` values of `view` (m cell, n cell)."""
+    """Means (m, n) of the squares of `cell` x `cell` values of `view` (m cell, n cell)."""
     m, n = (size // cell for size in view.shape)
-    # Each cell's values side by side: so they are added in one order, whatever view they are of.
+    # Contiguous cells are summed in the same order for every view.
     cells = np.ascontiguousarray(view.reshape(m, cell, n, cell).swapaxes(1, 2))
     means: F32 = cells.reshape(m, n, cell * cell).mean(axis=2)
     return means
 
 
 class SharedCells:
-    """The part of a robot's knowledge that it tells others: a byte for each cell of the world.
+    """A robot's knowledge for shared maps: a byte for each cell of the world.
 
     Not thread-safe: it belongs to the perception thread.
     """
 
     def __init__(self, parameters: PerceptionParameters) -> None:
-        """For `parameters` that have a `shared_map_cell`."""
+        """`parameters` must have a `shared_map_cell`."""
         self._cell = parameters.shared_map_cell
         self._told = parameters.shared_map_side
         self._side = -(-parameters.world_size // self._cell)
         self._codes: Codes = np.zeros((self._side, self._side), np.uint8)
 
     def see(self, view: F32, corner: tuple[int, int], seen: Bools | None = None) -> None:
-        """Know all cells that are wholly in the square `view`, whose lowest value is `corner`'s.
+        """Update all cells that are wholly in the square `view` with the lowest value at `corner`.
 
-        With `seen`, of the view's shape, those all of which it says was seen.
+        With `seen`, of the view's shape, only cells that were seen completely.
         """
         (x, stop_x), (y, stop_y) = self._wholly_in(corner, len(view))
         in_x, in_y = (
@@ -91,19 +90,19 @@ class SharedCells:
             np.copyto(self._codes[here], codes[there], where=whole[there])
 
     def see_world(self, codes: Codes, corner: tuple[int, int], size: int) -> None:
-        """As `see`, of a view of `size` x `size` of a world whose cells are all `codes`."""
+        """Like `see`, for a view of `size` x `size` of a world with the given `codes`."""
         (x, stop_x), (y, stop_y) = self._wholly_in(corner, size)
         here, _ = self._overlap((x, y), (stop_x - x, stop_y - y))
         self._codes[here] = codes[here]
 
     def hear(self, told: SharedMap) -> None:
-        """Know what another robot knows, where nothing was known."""
+        """Fill unknown cells from another robot's map."""
         here, there = self._overlap(told.corner, told.codes.shape)
         known = self._codes[here]
         np.copyto(known, told.codes[there], where=known == 0)
 
     def tell(self, position: F64) -> SharedMap:
-        """Known surroundings of `position` (2,), model units: as large as the local map."""
+        """Known surroundings of `position` (2,), model units, of the local map's size."""
         x, y = corner = window_corner(position / self._cell, self._told)
         codes = np.zeros((self._told, self._told), np.uint8)
         here, there = self._overlap(corner, codes.shape)
@@ -111,18 +110,18 @@ class SharedCells:
         return SharedMap((x, y), codes)
 
     def importance(self, corner: tuple[int, int], size: int) -> F32:
-        """(size, size) from model unit `corner` on, NaN where it is unknown or off the world."""
+        """Importance (size, size) from model unit `corner` on; NaN if unknown or off the world."""
         first = corner[0] // self._cell, corner[1] // self._cell
         codes = np.zeros((-(-size // self._cell) + 1,) * 2, np.uint8)
         here, there = self._overlap(first, codes.shape)
         codes[there] = self._codes[here]
-        # In this order whole rows are copied last, which takes half as long.
+        # This order copies whole rows last, which takes half the time.
         fine = importance_of(codes).repeat(self._cell, axis=1).repeat(self._cell, axis=0)
         x, y = corner[0] % self._cell, corner[1] % self._cell
         return fine[x : x + size, y : y + size]
 
     def _wholly_in(self, corner: tuple[int, int], size: int) -> tuple[tuple[int, int], ...]:
-        """First cell, and the one after the last, along x and y; the same if there is none."""
+        """First cell and end, along x and y, of the cells wholly in a view; equal if none."""
         firsts = [-(-start // self._cell) for start in corner]
         stops = [(start + size) // self._cell for start in corner]
         return tuple((first, max(first, stop)) for first, stop in zip(firsts, stops, strict=True))
@@ -130,7 +129,7 @@ class SharedCells:
     def _overlap(
         self, corner: tuple[int, int], shape: tuple[int, ...]
     ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Overlap of the world with cells of that shape from `corner` on: there, and here."""
+        """Overlap of the world with cells from `corner` on, as parts of both, world first."""
         (in_world_x, in_x), (in_world_y, in_y) = (
             overlap(start, size, self._side) for start, size in zip(corner, shape, strict=True)
         )

@@ -1,4 +1,4 @@
-"""Configurations as TOML files."""
+"""Reads TOML files of configurations."""
 
 import tomllib
 from pathlib import Path
@@ -9,12 +9,12 @@ from edge.core.schema import ConfigError
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a file. Raises ConfigError that names the file, and the line."""
+    """Read the tables of a file. Raises ConfigError that names the file and the line."""
     return parse_toml(read_toml_text(path), path)
 
 
 def read_toml_text(path: Path) -> str:
-    """The text of a file, its ends of lines as they are. Raises ConfigError."""
+    """Read a file's text, with unchanged line ends. Raises ConfigError."""
     try:
         return path.read_bytes().decode("utf-8-sig")
     except OSError as error:
@@ -24,7 +24,7 @@ def read_toml_text(path: Path) -> str:
 
 
 def parse_toml(text: str, where: Path | str) -> dict[str, Any]:
-    """The tables of a text. Raises ConfigError that begins with `where`, and names the line."""
+    """Parse a text. Raises ConfigError that begins with `where` and names the line."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

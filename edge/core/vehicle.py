@@ -1,7 +1,7 @@
-"""State and commands of a vehicle, as its autopilot has them; nothing of MAVLink.
+"""State and commands of a vehicle, independent of MAVLink.
 
-Local frame (see `frames`): x north, y east, z down, m, from the estimator's origin. Times are the
-robot's monotonic clock, s.
+Local frame (see `frames`): x north, y east, z down, m, from the estimator's origin. Times are by
+the robot's monotonic clock, s.
 """
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from msgspec import Struct
 Vector = tuple[float, float, float]
 
 
-# PX4's parameter of which of a receiver's measurements its estimator uses: bit 0 place, 1 height,
-# 2 velocity; 0: it goes without the receiver.
+# PX4's parameter for the estimator's use of the receiver: bit 0 position, 1 height, 2 velocity; 0
+# for none.
 GPS_CONTROL = "EKF2_GPS_CTRL"
 
 
 class Mode(StrEnum):
-    """The autopilot's flight modes, as far as the robot must tell them apart."""
+    """Flight modes of the autopilot that the robot distinguishes."""
 
     OFFBOARD = "offboard"
     HOLD = "hold"
@@ -34,12 +34,12 @@ class Mode(StrEnum):
     OTHER = "other"
 
 
-# A human's sticks move the vehicle.
+# Modes in which a human's sticks move the vehicle.
 PILOTED = frozenset({Mode.POSITION, Mode.ALTITUDE, Mode.STABILIZED, Mode.MANUAL})
 
 
 class Action(StrEnum):
-    """Commands to the autopilot, besides setpoints."""
+    """Commands to the autopilot, in addition to setpoints."""
 
     ARM = "arm"
     OFFBOARD = "offboard"
@@ -52,7 +52,7 @@ class Action(StrEnum):
 
 
 class ActionResult(NamedTuple):
-    """Outcome of a command; `text` says why it was refused, "" if it was accepted."""
+    """Outcome of a command; `text` is the reason of a refusal, "" if it was accepted."""
 
     action: Action
     accepted: bool
@@ -61,9 +61,9 @@ class ActionResult(NamedTuple):
 
 
 class AutopilotReason(NamedTuple):
-    """Why the autopilot refuses or does something: `code` is its own name for it, `text` in words.
+    """A reason from the autopilot: `code` is its own name, `text` is for people.
 
-    `arguments` are the numbers in it, such as which sensor.
+    `arguments` are its numbers, such as a sensor's index.
     """
 
     code: str
@@ -73,15 +73,13 @@ class AutopilotReason(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Gps:
-    """The receiver's own view: `fix` is MAVLink's GPS_FIX_TYPE (3 is 3-D), `hdop` without unit.
+    """The receiver's state: `fix` is MAVLink's GPS_FIX_TYPE (3 is 3-D), `hdop` has no unit.
 
-    `accuracy_m` is the horizontal accuracy that it claims for itself, None if it claims none.
-    `offset_m` and `velocity_offset_m_s` are how far in the plane its fix is from the estimator's
-    position and velocity, None if one of them is not known. `slip_m` is how far in the plane its
-    place has moved lately in another way than its velocity says, jumps apart; None if it tells no
-    velocity.
-    `at_s` is when its last new measurement was received, and `repeats` how many have told the same
-    place since another one.
+    `accuracy_m` is the horizontal accuracy reported by the receiver, None without one. `offset_m`
+    and `velocity_offset_m_s` are horizontal differences between its fix and the estimator's
+    position and velocity, None if unknown. `slip_m` is the recent horizontal difference between its
+    movement and its velocity, without jumps; None if it has no velocity. `at_s` is when its last
+    new measurement was received, `repeats` the number of repetitions of the same place.
     """
 
     fix: int
@@ -96,10 +94,10 @@ class Gps:
 
 
 class EstimatorStatus(NamedTuple):
-    """The autopilot's estimate of its own errors.
+    """The autopilot's estimate of its own errors, received at `at_s`.
 
-    `horizontal` is whether it vouches for a position and a velocity in the plane, `glitch` whether
-    it rejects the GPS; heard at `at_s`.
+    `horizontal`: it considers its horizontal position and velocity valid. `glitch`: it rejects the
+    GPS.
     """
 
     horizontal: bool
@@ -108,7 +106,7 @@ class EstimatorStatus(NamedTuple):
 
 
 class GlobalOrigin(NamedTuple):
-    """Where the estimator's local frame starts: WGS84 degrees, and m above mean sea level."""
+    """Origin of the estimator's local frame: WGS84 degrees, and m above mean sea level."""
 
     latitude_deg: float
     longitude_deg: float
@@ -116,27 +114,28 @@ class GlobalOrigin(NamedTuple):
 
 
 class VehicleState(Struct, frozen=True):
-    """Everything that was heard of the vehicle, the newest of each; None is not heard yet.
+    """The newest known state of the vehicle; None if not received yet.
 
     `position_local_m` and `velocity_local_m_s` were received together, at `position_at_s`; their
-    values last changed at `position_changed_at_s`, and jumped, in another way than `origin`
-    explains, at `jumped_at_s`. `height_jumped_m` is how far they have jumped up so in all, m,
-    since the vehicle was armed; the vehicle did not move when they did. Whether to trust them is
-    for `position.judge` to say.
-    `mode`, `armed` and `failsafe` (the autopilot acts on a failure by itself) come with its
-    heartbeat, once a second, last at `heartbeat_at_s`. `fell` is whether it was disarmed, or
-    switched on anew, while it was in the air by its own word; until it is armed again.
-    `origin` is the estimator's. `height_above_home_m` is above where the vehicle was armed, up
-    positive. `battery` is the remaining share, 0 to 1, `voltage_v` the pack's. Both, `armable` and
-    `remote_control` are None again once they were not heard for 2.5 s, and so is `thrust`, the
-    share of the greatest thrust, 0 to 1, that the autopilot asks of its motors. `problems` are the
-    autopilot's reasons why it would not arm, `warnings` what it finds wrong while it is armed, and
-    why it takes over; the gravest come first. `remote_control` tells whether it hears one.
-    `link_lost` is the share of the autopilot's messages that were lost on the way in the last ten
-    seconds, in steps of 5 %, and `link_twice` whether they arrive more than once.
-    `ignores_gps`: its estimator was told to go without the receiver.
-    `version` is its firmware's, such as "1.17.0".
-    `result` is the outcome of the last command that ended.
+    values last changed at `position_changed_at_s`, and last jumped, other than with `origin`, at
+    `jumped_at_s`. `height_jumped_m` is the sum of upward jumps since arming, m, during which the
+    vehicle did not move. `position.judge` decides whether to trust them.
+
+    `mode`, `armed` and `failsafe` (the autopilot acts on a failure) come with its heartbeat, once a
+    second, last at `heartbeat_at_s`. `fell`: it was disarmed or rebooted while it reported to be in
+    the air; reset by arming.
+
+    `origin` is the estimator's. `height_above_home_m` is above the place of arming, positive up.
+    `battery` is the remaining share, 0 to 1, `voltage_v` the pack's voltage. Both, `armable`,
+    `remote_control` and `thrust`, the requested share of the maximum thrust, 0 to 1, become None
+    again 2.5 s after the last message. `problems` are the autopilot's reasons not to arm,
+    `warnings` its faults while armed and reasons to take over, both with the most severe first.
+    `remote_control`: it receives one.
+
+    `link_lost` is the share of the autopilot's messages lost in the last ten seconds, in steps of 5
+    %, `link_twice` whether they arrive more than once. `ignores_gps`: its estimator is set to
+    ignore the receiver. `version` is the firmware's, such as "1.17.0". `result` is the outcome of
+    the last completed command.
     """
 
     connected: bool = False
@@ -174,13 +173,13 @@ class VehicleState(Struct, frozen=True):
 
 
 class Velocity(NamedTuple):
-    """Fly with this velocity: north, east, down, m/s."""
+    """Setpoint of a velocity: north, east, down, m/s."""
 
     velocity_local_m_s: Vector
 
 
 class Position(NamedTuple):
-    """Fly to this position: north, east, down, m."""
+    """Setpoint of a position: north, east, down, m."""
 
     position_local_m: Vector
 

@@ -1,12 +1,12 @@
 """The world: an importance density function (IDF) as features, and its raster.
 
-Model units, x and y from the world's corner. The raster is what CoverageControl 1.3.1 makes of the
-same features, because the policies are trained on its worlds, but for two of its faults:
+Model units, x and y from the world's corner. The raster equals CoverageControl 1.3.1's for the same
+features, because the policies are trained on its worlds, except for two of its faults:
 
-- It evaluates the cells' integrals as differences of float32 numbers, which leaves noise on them,
-  up to 0.4 % of the maximum at a standard deviation of 60 cells, and rarely decides otherwise about
-  a cell on the edge of the truncation. Here they are exact.
-- It takes every `BND` for circular with `sigma_x`. Here `sigma_y` and `rho` count.
+- It computes integrals over cells as differences of float32 numbers. Their noise is up to 0.4 % of
+  the maximum at a standard deviation of 60 cells, and rarely changes a cell on the edge of the
+  truncation. Here they are exact.
+- It treats every `BND` as circular with `sigma_x`. Here `sigma_y` and `rho` count.
 """
 
 import itertools
@@ -23,9 +23,9 @@ from msgspec import Meta
 from edge.core import F32, F64
 from edge.core.schema import Bounded, NonNegative
 
-# To make a raster of more takes a robot minutes.
+# A raster of more features takes a robot minutes.
 MOST_FEATURES = 2000
-# What the library's C++ streams read as one number; Python's own float() takes more, such as 1_0.
+# Numbers that the library's C++ streams accept; Python's float() accepts more, such as 1_0.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COUNT = re.compile(r"\+?\d+", re.ASCII)
 # Far beyond every world, and small enough to be squared without loss.
@@ -51,7 +51,7 @@ class GaussianFeature(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class PolygonFeature(Bounded):
-    """The same importance throughout a polygon, which may be concave and runs either way round.
+    """Constant importance in a polygon, possibly concave, with either orientation.
 
     Raises ValueError unless there are 3 vertices or more, all numbers are finite, importance >= 0.
     """
@@ -64,13 +64,13 @@ Feature = GaussianFeature | PolygonFeature
 
 
 def parse_world(text: str, source: str = "world") -> tuple[Feature, ...]:
-    """The features of a CoverageControl world file (`.env`), in the file's order.
+    """Read the features of a CoverageControl world file (`.env`), in its order.
 
-    Records are words separated by any white space, line ends included:
-    `CircularBND x y sigma scale`, `BND x y sigma_x sigma_y rho scale` and
-    `Uniform num_vertices importance x1 y1 x2 y2 ...`. Until April 2024 the library had a polygon's
-    importance last: that is read where only it makes sense, and refused where both orders do.
-    Raises ValueError, one line with `source`, the record's number and kind, and what is wrong.
+    Records are words separated by white space, including line ends: `CircularBND x y sigma scale`,
+    `BND x y sigma_x sigma_y rho scale` and `Uniform num_vertices importance x1 y1 x2 y2 ...`. Until
+    April 2024 the library wrote a polygon's importance last: that order is read if only it makes
+    sense, and refused if both do. Raises ValueError, one line with `source`, the record's number
+    and kind, and the cause.
     """
     words = _Reader(text)
     features: list[Feature] = []
@@ -84,24 +84,24 @@ def parse_world(text: str, source: str = "world") -> tuple[Feature, ...]:
 
 
 def format_world(features: tuple[Feature, ...]) -> str:
-    """The world file of `features`, as the library writes it, but for a record's first line end.
+    """Write the world file of `features` in the library's form, except a record's first line end.
 
-    `parse_world` gives them back exactly: a polygon's vertices are on lines of their own.
+    `parse_world` reads it back exactly: each vertex of a polygon is on its own line.
     """
     return "".join(f"{_record(feature)}\n" for feature in features)
 
 
 def random_features(
-    rng: "np.random.Generator",  # as text: to load it costs a robot 7 MB
+    rng: "np.random.Generator",  # quoted: importing it costs a robot 7 MB
     count: int,
     world_size: int,
     sigma: tuple[float, float] = (40.0, 60.0),
     scale: tuple[float, float] = (6.0, 10.0),
 ) -> tuple[GaussianFeature, ...]:
-    """`count` circular Gaussians, uniform in mean over the world, in sigma and in scale.
+    """Draw `count` circular Gaussians, uniform in mean over the world, in sigma and in scale.
 
-    `sigma` and `scale` are (least, greatest). The reference library draws its worlds so; what it
-    calls a feature's peak, `MinPeak` to `MaxPeak`, is the scale: the integral, not the maximum.
+    `sigma` and `scale` are (least, greatest). The reference library draws worlds in this way; its
+    feature's peak, `MinPeak` to `MaxPeak`, is the scale: the integral, not the maximum.
     """
     means = rng.uniform(0.0, world_size, (count, 2)).tolist()
     sigmas = rng.uniform(*sigma, count).tolist()
@@ -117,18 +117,18 @@ def rasterize(
 ) -> F32:
     """The IDF on a raster (world_size, world_size), indexed [x, y]; cell side one model unit.
 
-    A Gaussian adds its integral over the cell where the cell's centre lies within `truncation`
-    standard deviations of the mean (Mahalanobis distance). To the sum of the Gaussians the largest
-    of the polygons around the cell's centre is added; a centre on an outline is outside, and where
-    a polygon overlaps itself every second layer is. The whole is scaled to the maximum `norm`;
-    without any importance it stays zero.
+    A Gaussian adds its integral over each cell with a centre within `truncation` standard
+    deviations of the mean (Mahalanobis distance). The largest of the polygons around the cell's
+    centre is added to the sum of Gaussians; centres on an outline are outside, and so is every
+    second layer of a polygon that overlaps itself. The raster is scaled to the maximum `norm`;
+    without importance it is zero.
 
-    The integral is exact to rounding, but for correlated Gaussians quadrature, good to 1e-6 of the
-    maximum while the feature's smallest standard deviation in any direction is one cell or more.
+    Integrals are exact to rounding, except for correlated Gaussians: quadrature, good to 1e-6 of
+    the maximum if the feature's smallest standard deviation in any direction is at least one cell.
     """
     raster = np.zeros((world_size, world_size), np.float32)
     polygons = np.zeros_like(raster)
-    # Relative to the largest weight, since float32 does not hold every number that a file may.
+    # Relative to the largest weight: float32 does not hold every number that a file may contain.
     largest = max((_weight(feature) for feature in features), default=0.0)
     if largest == 0.0:
         return raster
@@ -156,7 +156,7 @@ def rasterize(
 
 
 def has_importance(features: Iterable[Feature]) -> bool:
-    """Whether there is anything to cover: a feature of a scale, or an importance, above 0."""
+    """Whether any feature has a scale or importance above 0."""
     return any(_weight(feature) > 0.0 for feature in features)
 
 
@@ -168,7 +168,7 @@ _Box = tuple[slice, slice]
 
 
 def _cells_between(lower: tuple[float, float], upper: tuple[float, float], world_size: int) -> _Box:
-    """The world's cells that the rectangle from `lower` to `upper` touches."""
+    """The world's cells in the rectangle from `lower` to `upper`."""
     x, y = (
         slice(min(max(math.floor(a), 0), world_size), min(max(math.ceil(b), 0), world_size))
         for a, b in zip(lower, upper, strict=True)
@@ -182,7 +182,7 @@ def _centres(box: _Box) -> tuple[F64, F64]:
 
 
 def _gaussian_cells(feature: GaussianFeature, truncation: float, x: F64, y: F64) -> F64:
-    """(len(x), len(y)): of the feature's integral the share in the cells with these centres."""
+    """Shares (len(x), len(y)) of the feature's integral in the cells with these centres."""
     rho = feature.correlation
     u = (x - feature.mean[0]) / feature.sigma[0]
     v = (y - feature.mean[1]) / feature.sigma[1]
@@ -202,9 +202,9 @@ def _gaussian_cells(feature: GaussianFeature, truncation: float, x: F64, y: F64)
 
 
 def _normal_integral(z: F64, half_width: float) -> F64:
-    """(len(z),): integrals of the standard normal density over z - half_width to z + half_width.
+    """Integrals (len(z),) of the standard normal density from z - half_width to z + half_width.
 
-    `z` are centres that lie two half widths apart, ascending.
+    `z` are ascending centres, two half widths apart.
     """
     edges = np.append(z - half_width, z[-1:] + half_width)
     cumulated = [0.5 * math.erf(edge / math.sqrt(2.0)) for edge in edges.tolist()]
@@ -212,14 +212,14 @@ def _normal_integral(z: F64, half_width: float) -> F64:
 
 
 def _mahalanobis2(u: F64, v: F64, rho: float) -> F64:
-    """(len(u), len(v)): squared Mahalanobis distances, `u` and `v` in standard deviations."""
+    """Squared Mahalanobis distances (len(u), len(v)); `u` and `v` in standard deviations."""
     u = u[:, None]
     distance2: F64 = (u * u - 2.0 * rho * u * v + v * v) / (1.0 - rho * rho)
     return distance2
 
 
 def _inside(vertices: tuple[tuple[float, float], ...], x: F64, y: F64) -> npt.NDArray[np.bool_]:
-    """(len(x), len(y)): whether an odd number of edges lies to one side; `y` ascending."""
+    """Whether an odd number of edges lies to one side, (len(x), len(y)); `y` ascending."""
     inside = np.zeros((len(x), len(y)), np.bool_)
     on_edge = np.zeros_like(inside)
     for (xa, ya), (xb, yb) in zip(vertices, vertices[1:] + vertices[:1], strict=True):
@@ -236,16 +236,16 @@ def _inside(vertices: tuple[tuple[float, float], ...], x: F64, y: F64) -> npt.ND
 
 
 class _Reader:
-    """A file's words, from the first to the last."""
+    """Words of a file in order."""
 
     def __init__(self, text: str) -> None:
         lines = enumerate(text.splitlines())
         self._words = ((word, number) for number, line in lines for word in line.split())
-        # That of the word which was taken last.
+        # Line of the last word.
         self.line = 0
 
     def take(self) -> str:
-        """The next word; empty at the end."""
+        """The next word; "" at the end."""
         word, self.line = next(self._words, ("", self.line))
         return word
 
@@ -277,7 +277,7 @@ def _read_polygon(words: _Reader) -> PolygonFeature:
             numbers.append(_read_number(words, name, expected))
             lines.append(words.line)
     orders = [_Order(numbers[0], numbers[1:], lines[1:]), _Order(numbers[-1], numbers[:-1], lines)]
-    # A line may end anywhere but in a vertex: how it is laid out says more than what it holds.
+    # Lines end anywhere except within a vertex, so the layout says more than the values.
     for makes_sense in (_Order.is_whole, _Order.is_weighted, _Order.is_simple):
         orders = [order for order in orders if makes_sense(order)] or orders
     if len(orders) == 2:
@@ -291,7 +291,7 @@ def _read_polygon(words: _Reader) -> PolygonFeature:
 
 
 class _Order:
-    """One of the two orders in which a polygon's numbers may have been written."""
+    """One of the two possible orders of a polygon's numbers."""
 
     def __init__(self, importance: float, coordinates: list[float], lines: list[int]) -> None:
         self.importance = importance
@@ -310,7 +310,7 @@ class _Order:
 
 
 def _is_simple(vertices: tuple[tuple[float, float], ...]) -> bool:
-    """Whether no corner is doubled, and no side meets another but in the corner between them."""
+    """Whether no corner is repeated, and sides only meet in the corners between them."""
     a = np.array(vertices)
     b = np.roll(a, -1, axis=0)
     side = b - a
@@ -357,5 +357,5 @@ def _record(feature: Feature) -> str:
 
 
 def _words(*numbers: float) -> str:
-    # float() because NumPy's own scalars have another repr.
+    # NumPy's scalars have another repr.
     return " ".join(repr(float(number)) for number in numbers)

@@ -1,4 +1,4 @@
-"""The value that most have."""
+"""The most common value."""
 
 from collections import Counter
 from collections.abc import Hashable, Iterable
@@ -8,6 +8,6 @@ T = TypeVar("T", bound=Hashable)
 
 
 def commonest(values: Iterable[T | None]) -> T | None:
-    """Value of most of those that have one; of equals the first."""
+    """The most common of the truthy values, the first one in a tie; None if there are none."""
     counts = Counter(value for value in values if value)
     return max(counts, key=counts.__getitem__, default=None)
