@@ -8,7 +8,6 @@ mkdir -p "$day" || exit
 
 lpac fleet doctor --laptop --json > "$day/laptop.json"
 lpac fleet doctor --json > "$day/doctor.json"
-lpac fleet ping --json > "$day/ping.json"
 lpac fleet status --json > "$day/status.json"
 lpac fleet exec --json 'uname -a; systemctl --version | head -n 1; python3 --version
     rsync --version | head -n 1; docker --version; dpkg -l | grep -i voxl; lscpu; ls /data/px4/log

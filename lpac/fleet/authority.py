@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import (
     Ed25519PrivateKey,
     Ed25519PublicKey,
 )
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from cryptography.x509.oid import NameOID
 
 from edge.core.schema import ConfigError, require
 from edge.drivers.identity_folder import (
@@ -78,7 +78,6 @@ class _Ledger(msgspec.Struct):
     fleet: str
     serial: int = 0
     revocations: int = 0
-    releases: int = 0
     members: list[Member] = []
     # Hexadecimal digits, the newest first; somebody who has the first is a member no more, if so.
     group_keys: list[str] = []
@@ -194,23 +193,6 @@ class Authority:
         """The signed list of revoked keys."""
         return (self.folder / _REVOKED).read_bytes()
 
-    def sign_release(self, manifest_sha256: str) -> str:
-        """A certificate for a release, newer than all before, in PEM.
-
-        A certificate, as OpenSSL 1.1.1 checks no other Ed25519 signature; it lets nobody in.
-        """
-        with self._changed() as ledger:
-            # A copy of the authority elsewhere counts on, too.
-            ledger.releases = max(ledger.releases + 1, int(time.time()))
-            number = ledger.releases
-        certificate = (
-            _unsigned(manifest_sha256, self.fleet, self._key.public_key(), number)
-            .add_extension(x509.BasicConstraints(False, None), True)
-            .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CODE_SIGNING]), True)
-            .sign(self._key, None)
-        )
-        return certificate.public_bytes(serialization.Encoding.PEM).decode()
-
     def own_name(self) -> str | None:
         """Of the operator in this very folder; None if there is nobody's identity."""
         try:
@@ -318,27 +300,19 @@ def _certificate(
     is_authority: bool = False,
 ) -> bytes:
     certificate = (
-        _unsigned(common_name, fleet, public_key, x509.random_serial_number())
+        x509.CertificateBuilder()
+        .subject_name(_name(common_name, fleet))
+        .issuer_name(_name("authority", fleet))
+        .public_key(public_key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(_ALWAYS[0])
+        .not_valid_after(_ALWAYS[1])
         .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), True)
         # rustls, which zenoh has, takes no certificate without one.
         .add_extension(x509.SubjectAlternativeName([x509.DNSName(common_name)]), False)
         .sign(issuer, None)
     )
     return certificate.public_bytes(serialization.Encoding.PEM)
-
-
-def _unsigned(
-    common_name: str, fleet: str, public_key: Ed25519PublicKey, number: int
-) -> x509.CertificateBuilder:
-    return (
-        x509.CertificateBuilder()
-        .subject_name(_name(common_name, fleet))
-        .issuer_name(_name("authority", fleet))
-        .public_key(public_key)
-        .serial_number(number)
-        .not_valid_before(_ALWAYS[0])
-        .not_valid_after(_ALWAYS[1])
-    )
 
 
 def _name(common_name: str, fleet: str) -> x509.Name:

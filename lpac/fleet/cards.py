@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 from edge.identity.card import Role
 from lpac.fleet.authority import Authority, AuthorityError, Member, create_authority, new_member
 from lpac.fleet.hold import Report, hold
+from lpac.fleet.program import start, stop
 from lpac.fleet.session import Session
 from lpac.fleet.settings import FleetConfig, RobotHost
 
@@ -105,9 +106,8 @@ async def give_group_keys(session: Session, config: FleetConfig, robot: RobotHos
 
 
 async def _restart(session: Session, config: FleetConfig, robot: RobotHost) -> None:
-    await session.call(
-        "restart", directory=config.directory, mavlink_port=robot.mavlink_port, in_flight=False
-    )
+    await stop(session, robot, in_flight=False, disable=False)
+    await start(session, config)
 
 
 async def _write_card(

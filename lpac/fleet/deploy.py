@@ -1,16 +1,28 @@
 """A release's way to a robot: travel, be checked whole, prove itself, switch; or change nothing."""
 
-from pathlib import Path
-from typing import NamedTuple
+import json
+from collections.abc import Iterable, Set
+from typing import Any, NamedTuple
 
-from lpac.fleet.cards import open_authority
-from lpac.fleet.hold import Held, Report, hold
+from lpac.fleet.hold import Held, Report, earlier_than, hold
+from lpac.fleet.program import require_disarmed
 from lpac.fleet.release import Release
-from lpac.fleet.session import FleetError, RemoteError, rsync
+from lpac.fleet.session import Done, FleetError, RemoteError, Session, rsync
 from lpac.fleet.settings import FleetConfig, RobotHost
 
-# Of folders; files keep theirs, which the manifest has.
-_MODES = "--chmod=Du=rwx,Dgo=rx"
+_MARGIN_MB = 100.0
+# Of the policy's verification, on a slow CPU.
+_VERIFY_S = 150.0
+# A program in a release's file system, as the unit runs it, but before any switch: as nobody, or as
+# root with a folder that it sees at /var/lib and may only read.
+_INSIDE = """set -e; cd "$1/root"; state=$2; shift 2; mount --bind .. release
+user=--userspec=65534:65534
+if [ "$state" ]; then
+    user=--userspec=0:0; mount --bind "$state" var/lib; mount -o remount,bind,ro var/lib
+fi
+mount -t proc proc proc; mount --rbind /sys sys; mount --rbind /dev dev
+mount -t tmpfs tmpfs tmp; exec nice -n 5 chroot "$user" . /usr/bin/lpac "$@"
+"""
 
 
 class Deployed(NamedTuple):
@@ -23,15 +35,22 @@ class Deployed(NamedTuple):
     infer_p99_ms: float | None
 
 
+async def lpac_inside(session: Session, release: str, *command: str, state: str = "") -> Done:
+    """Run `lpac` of the release in that folder of the robot's, with /release as the unit has it.
+
+    As nobody; or as root, where `state` is a folder that it sees at /var/lib, and cannot change.
+    """
+    inside = ("unshare", "--mount", "sh", "-c", _INSIDE, "sh", release, state)
+    return await session.run(*inside, *command, timeout_s=_VERIFY_S)
+
+
 async def deploy(
     config: FleetConfig, robot: RobotHost, release: Release, report: Report
 ) -> Deployed:
     """Bring `release` to the robot and run it there, or leave what runs untouched.
 
     Raises FleetError that says what went wrong; the robot then has what it had before.
-    AuthorityError: the fleet has keys, and its authority is not on this computer.
     """
-    authority = None if config.keys is None else open_authority(config)
     async with hold(config, robot, report) as held:
         before, session = held.found, held.session
         if before["machine"] != release.image.machine:
@@ -42,74 +61,149 @@ async def deploy(
         spare = config.slot_of(robot.name) is None
         runs = spare or before["service"]["fresh"]
         if before["current"] == release.id and before["pending"] is None and runs:
-            return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
-        sent_bytes = await _bring(config, robot, release, held, report)
-        signature = authority and authority.sign_release(release.manifest_sha256)
-        await session.call(
-            "sign", directory=config.directory, release=release.id, signature=signature
-        )
-        proof = await session.call("prove", directory=config.directory, release=release.id)
+            report("check", None)
+            if await _is_whole(session, f"{config.directory}/current/"):
+                return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
+        await require_disarmed(session, robot, "deploying")
+        incoming = f"{config.directory}/incoming/{release.id}"
+        await _make_room(session, config, release, before, incoming)
+        sent_bytes = await _send(config, robot, release, held, incoming, report)
+        steps = await _prove(session, release, incoming, report)
         report("switch", None)
-        after = await session.call(
-            "switch", directory=config.directory, release=release.id,
-            mavlink_port=robot.mavlink_port,
-        )  # fmt: skip
-        steps = proof["benchmark"]["steps"]
-        return Deployed(
-            after["current"],
-            "spare, not started" if spare else "runs",
-            sent_bytes,
-            steps["perceive"]["p99_ms"],
-            steps["infer"]["p99_ms"],
+        await require_disarmed(session, robot, "switching")
+        await _switch(session, config, robot, release, before, incoming)
+        summary = "spare, not started" if spare else "runs"
+        perceive_ms, infer_ms = steps["perceive"]["p99_ms"], steps["infer"]["p99_ms"]
+        return Deployed(release.id, summary, sent_bytes, perceive_ms, infer_ms)
+
+
+async def _is_whole(session: Session, folder: str) -> bool:
+    try:
+        await session.call("check", folder=folder)
+    except RemoteError:
+        return False
+    return True
+
+
+async def _make_room(
+    session: Session, config: FleetConfig, release: Release, found: dict[str, Any], incoming: str
+) -> None:
+    """Make the folder to fill; what came of this release before it broke off is still there.
+
+    Raises RemoteError if the disk has no room.
+    """
+    await session.must("mkdir", "-p", incoming, f"{config.directory}/releases")
+    others = ("-mindepth", "1", "-maxdepth", "1", "!", "-name", release.id, "-exec", "rm", "-rf")
+    await session.must("find", f"{config.directory}/incoming", *others, "{}", "+")
+    # One that did not run well may be left, or that a rollback left behind.
+    names, number = found["releases"], found["number"]
+    newer = next((name for name in names if name != number), None)
+    await _keep(session, config, names, {number, earlier_than(number, names) or newer})
+    said = await session.look({
+        "came": f"du -sb {incoming}", "free": f"df -B1 --output=avail {incoming} | tail -n 1",
+    })  # fmt: skip
+    needed_mb = _MARGIN_MB
+    if not any(its["image"] == release.image.id for its in found["releases"].values()):
+        needed_mb += max(0.0, release.size_bytes - float(said["came"].split()[0])) / 1e6
+    free_mb = float(said["free"]) / 1e6
+    if free_mb < needed_mb:
+        raise RemoteError(
+            f"the disk has {free_mb:.0f} MB free, and the release needs {needed_mb:.0f} MB: remove "
+            "old logs, but not the newest (`lpac fleet pull`, then `lpac fleet exec`)"
         )
 
 
-async def _bring(
-    config: FleetConfig, robot: RobotHost, release: Release, held: Held, report: Report
+async def _send(
+    config: FleetConfig,
+    robot: RobotHost,
+    release: Release,
+    held: Held,
+    incoming: str,
+    report: Report,
 ) -> int:
-    """Have the release whole on the robot; how many bytes of content travelled."""
-    session = held.session
-    place = await session.call(
-        "prepare", directory=config.directory, release=release.id, image=release.image.id,
-        size_bytes=release.size_bytes, mavlink_port=robot.mavlink_port,
-    )  # fmt: skip
-    if place["complete"]:
-        return 0
-    target, like = f":{place['incoming']}", place["like"]
+    """Have the release in `incoming`; how many bytes of content travelled.
 
-    async def send(step: str, folder: Path, below: str, *options: str) -> int:
-        try:
-            return await rsync(
-                config, robot, [f"{folder}/"], f"{target}{below}/",
-                options=["--delete", "--partial", _MODES, *options,
-                         *(f"--link-dest={folder}{below}" for folder in like)],
-                sudo=held.found["sudo"], on_share=lambda share: report(step, share),
-            )  # fmt: skip
-        except FleetError as error:
-            if "disk is full" in str(error):
-                await session.call("discard", directory=config.directory, release=release.id)
-            raise
+    Files that the robot has in another release, and that are whole there, are linked to.
+    """
+    like = [f"--link-dest={config.directory}/releases/{name}" for name in held.found["releases"]]
+    try:
+        return await rsync(
+            config, robot, [f"{release.folder}/", str(release.image.folder)], f":{incoming}/",
+            # Of folders; files keep their modes, which the manifest has.
+            options=["--delete", "--partial", "--chmod=Du=rwx,Dgo=rx", *like],
+            sudo=held.found["sudo"], on_share=lambda share: report("send", share),
+        )  # fmt: skip
+    except FleetError as error:
+        if "disk is full" in str(error):
+            await held.session.must("rm", "-rf", incoming)
+        raise
 
-    async def accept() -> None:
-        report("check", None)
-        await session.call("accept", directory=config.directory, release=release.id)
 
-    sent_bytes = await send("policy", release.folder, "", "--exclude=/root")
-    if place["has_image"]:
-        try:
-            await accept()
-            return sent_bytes
-        except RemoteError:
-            pass  # The image that was there is damaged.
-    sent_bytes += await send("image", release.image.folder, "/root")
-    await accept()
-    return sent_bytes
+async def _prove(
+    session: Session, release: Release, incoming: str, report: Report
+) -> dict[str, Any]:
+    """Check every file that has come, run the policy's own verification, and time it on this CPU.
+
+    Raises RemoteError if a file is not whole, the policy does not compute what it must, or is slow.
+    """
+    report("check", None)
+    manifest = await session.must("sha256sum", f"{incoming}/manifest.json")
+    if not manifest.startswith(release.id):
+        raise RemoteError("the manifest that came is not the release's: deploy again")
+    await session.call("check", folder=incoming)
+    bundle = ("/release/bundle", "--json")
+    commands = (("verify", *bundle), ("benchmark", *bundle, "--seconds", "1"))
+    for command in commands:
+        report(command[0], None)
+        done = await lpac_inside(session, incoming, "bundle", *command)
+        if done.code != 0 and command[0] == "benchmark":
+            # Something else may have run beside the first.
+            done = await lpac_inside(session, incoming, "bundle", *command)
+        if done.code != 0:
+            raise RemoteError(f"bundle {command[0]} on the robot: {done.reason}")
+    steps: dict[str, Any] = json.loads(done.out)["steps"]
+    return steps
+
+
+async def _switch(
+    session: Session,
+    config: FleetConfig,
+    robot: RobotHost,
+    release: Release,
+    before: dict[str, Any],
+    incoming: str,
+) -> None:
+    """Run the release that has come; it and the one before it are kept."""
+    releases = before["releases"]
+    number = max([release.number, *(int(name) + 1 for name in releases if name.isdigit())])
+    place = f"{config.directory}/releases"
+    await session.must("sync", "--file-system", place, timeout_s=120.0)
+    await session.must("mv", "--no-target-directory", incoming, f"{place}/{number}")
+    await session.call("switch", directory=config.directory, release=str(number),
+                       mavlink_port=robot.mavlink_port)  # fmt: skip
+    same = before["current"] == release.id
+    former = earlier_than(before["number"], releases) if same else before["number"]
+    await _keep(session, config, releases, {former})
+
+
+async def _keep(
+    session: Session, config: FleetConfig, names: Iterable[str], kept: Set[str | None]
+) -> None:
+    """Remove the other releases of these names."""
+    gone = [f"{config.directory}/releases/{name}" for name in names if name not in kept]
+    if gone:
+        await session.must("rm", "-rf", *gone)
 
 
 async def rollback(config: FleetConfig, robot: RobotHost, report: Report) -> str:
-    """Run the last good release again; its id. Raises FleetError."""
-    async with hold(config, robot, report) as held:
-        after = await held.session.call(
-            "rollback", directory=config.directory, mavlink_port=robot.mavlink_port
-        )
-        return str(after["current"])
+    """Run the release before the current one again; its id. Raises FleetError."""
+    async with hold(config, robot, report) as (session, found, _):
+        await require_disarmed(session, robot, "rolling back")
+        name = earlier_than(found["number"], found["releases"])
+        if name is None or found["earlier"] is None:
+            raise RemoteError("there is no earlier release to go back to")
+        report("check", None)
+        await session.call("check", folder=f"{config.directory}/releases/{name}")
+        await session.call("switch", directory=config.directory, release=name,
+                           mavlink_port=robot.mavlink_port)  # fmt: skip
+        return str(found["earlier"])

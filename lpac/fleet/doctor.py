@@ -1,6 +1,8 @@
 """Checks of a robot before a flight: looked at over SSH, judged here, each fault with its fix."""
 
+import asyncio
 import hashlib
+import json
 import re
 import shlex
 import time
@@ -12,8 +14,11 @@ from edge.core.counted import counted
 from edge.core.schema import ConfigError
 from edge.drivers.identity_folder import card_in
 from edge.messages.codes import CheckCode, FailedCheck, texts
-from lpac.fleet.hold import Report, lock, wrong_identity
+from lpac.fleet import probes
+from lpac.fleet.deploy import lpac_inside
+from lpac.fleet.hold import Report, lock, overview, wrong_identity
 from lpac.fleet.operations import Outcome
+from lpac.fleet.program import hear_heartbeat
 from lpac.fleet.session import RemoteError, Session, connect
 from lpac.fleet.settings import FleetConfig, RobotHost
 from lpac.fleet.writer import robot_toml
@@ -27,6 +32,12 @@ MOST_CLOCK_OFFSET_S = 0.5
 GOOD_CLOCK_OFFSET_S = 0.05
 _EXCHANGES = 5
 _PINGS = 10
+# How long the program may take, after its start, until its first checks are done; and the failed
+# checks that mean that it has not looked yet.
+_CHECKS_WAIT_S = 8.0
+_NOT_SETTLED = {CheckCode.CHECKS_RUNNING.value, CheckCode.FAILSAFE_NOT_READ.value}
+# `lpac robot check` waits so long for the vehicle; the ground will be missing to its end.
+_CHECK_S = 10.0
 _LOST_TOO_MUCH, _SLOW_MS = 0.1, 50.0
 
 _MB = 1e6
@@ -131,12 +142,18 @@ async def examine(
     report("connect", None)
     async with connect(config, robot, lambda step: report(step, None)) as session:
         clock = await measure_clock(session, unix_time_s)
-        facts = await session.call(
-            "facts", directory=config.directory, mavlink_port=robot.mavlink_port,
-            names=[*_PX4_PARTS, *_COMMANDERS, *config.predecessors],
-        )  # fmt: skip
-        pings = await ping_others(session, others)
-        vehicle = await _check_vehicle(config, robot, session, facts)
+        report("looks", None)
+        names = [*_PX4_PARTS, *_COMMANDERS, *config.predecessors]
+        facts = await overview(session, config)
+        facts |= await probes.facts(session, config.directory, names)
+        facts["service"] = await _settled(session, facts["service"])
+        facts["heartbeat"] = None
+        if facts["service"]["active"] != "active":
+            report("listens to PX4", None)
+            facts["heartbeat"] = await hear_heartbeat(session, robot)
+        report("pings", None)
+        pings = await _ping_others(session, others)
+        vehicle = await _check_vehicle(config, robot, session, facts, report)
         return Examination(facts, clock, vehicle, pings)
 
 
@@ -147,7 +164,7 @@ async def measure_clock(
     best: ClockOffset | None = None
     for _ in range(_EXCHANGES):
         asked_s = unix_time_s()
-        there_s = float((await session.call("clock"))["unix_time_s"])
+        there_s = float(await session.must("date", "+%s.%N"))
         answered_s = unix_time_s()
         half_s = (answered_s - asked_s) / 2.0
         if best is None or half_s < best.uncertainty_s:
@@ -156,22 +173,36 @@ async def measure_clock(
     return best
 
 
-async def ping_others(session: Session, others: Sequence[RobotHost]) -> Mapping[str, Facts] | str:
+async def _settled(session: Session, state: dict[str, Any]) -> dict[str, Any]:
+    """The unit's state once the program has done its first checks, if it runs."""
+    until_s = time.monotonic() + _CHECKS_WAIT_S
+    while state["fresh"] and time.monotonic() < until_s:
+        codes = {check["code"] for check in state["status"]["failed_checks"]}
+        if not codes & _NOT_SETTLED:
+            break
+        await asyncio.sleep(0.25)
+        state = await session.call("service")
+    return state
+
+
+async def _ping_others(session: Session, others: Sequence[RobotHost]) -> Mapping[str, Facts] | str:
     """ICMP echo from the robot to the others, or why there is none. Raises UnreachableError."""
     if not others:
         return {}
     try:
-        return await session.call(
-            "ping", addresses={other.name: other.address for other in others}, count=_PINGS
-        )
+        return await probes.ping(session, {other.name: other.address for other in others}, _PINGS)
     except RemoteError as error:
         return str(error)
 
 
 async def _check_vehicle(
-    config: FleetConfig, robot: RobotHost, session: Session, facts: Facts
+    config: FleetConfig, robot: RobotHost, session: Session, facts: Facts, report: Report
 ) -> Facts | str:
-    """The release's own check of the vehicle, where nothing speaks against running it."""
+    """The release's own check of the vehicle, where nothing speaks against running it.
+
+    With `parameters = "set"` in its configuration it sets PX4's parameters, as it would when run.
+    The lock keeps everybody from starting the program meanwhile.
+    """
     if config.slot_of(robot.name) is None:
         return "it is a spare: without a slot it has no configuration"
     if facts["current"] is None:
@@ -184,32 +215,20 @@ async def _check_vehicle(
         return "PX4 does not answer"
     if facts["heartbeat"]["armed"]:
         return "the vehicle is armed"
+    report("reads PX4's parameters", None)
     try:
         await lock(session, config, robot)
-        return await session.call("vehicle_check", directory=config.directory)
+        done = await lpac_inside(
+            session, f"{config.directory}/current", "robot", "check", "--config",
+            "/release/robot.toml", "--json", "--wait", f"{_CHECK_S:g}",
+            # Who it is in its fleet, which is for the program's user alone.
+            state="" if config.keys is None else "/var/lib/private",
+        )  # fmt: skip
+        return dict(json.loads(done.out))
     except RemoteError as error:
         return str(error)
-
-
-class Round(NamedTuple):
-    """One robot's way to the laptop, ms, and to the other robots (see `probes.ping`)."""
-
-    laptop_ms: float
-    others: Mapping[str, Facts] | str
-
-
-async def measure_radio(
-    config: FleetConfig, robot: RobotHost, others: Sequence[RobotHost], report: Report
-) -> Round:
-    """The quickest of some questions over SSH, and pings. Raises FleetError."""
-    report("connect", None)
-    async with connect(config, robot, lambda step: report(step, None)) as session:
-        times_ms = []
-        for _ in range(_EXCHANGES):
-            asked_s = time.monotonic()
-            await session.call("clock")
-            times_ms.append(1000.0 * (time.monotonic() - asked_s))
-        return Round(min(times_ms), await ping_others(session, others))
+    except ValueError:
+        return done.reason
 
 
 # Judging: pure
@@ -433,7 +452,7 @@ def _program(
     peers, wanted = service["status"]["peers"], len(running) - 1
     if peers < wanted:
         found = f"it is connected to {peers} of the {wanted} other programs"
-        return DoctorCheck(name, "warning", found, "lpac fleet ping")
+        return DoctorCheck(name, "warning", found, "lpac fleet radio")
     return DoctorCheck(name, "ok", f"runs: {service['status']['state']}, {peers} peers")
 
 
@@ -542,7 +561,7 @@ def _radio(pings: Mapping[str, Facts] | str, answering: set[str]) -> DoctorCheck
     if not heard:
         return DoctorCheck(name, "skipped", "no other robot answers")
     fix = (
-        "lpac fleet ping; all must be in one network, and the access point must let its clients "
+        "lpac fleet radio; all must be in one network, and the access point must let its clients "
         "reach each other"
     )
     deaf = [other for other, ping in heard.items() if ping["loss"] >= 1.0]

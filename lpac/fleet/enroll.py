@@ -8,16 +8,15 @@ import re
 import socket
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
 
 from edge.core.address import require_host
 from edge.core.schema import ConfigError
 from lpac.fleet.cards import CardGiven, give_card
 from lpac.fleet.deploy import deploy
-from lpac.fleet.hold import lock
+from lpac.fleet.hold import lock, overview
 from lpac.fleet.release import load_common, make_release
 from lpac.fleet.session import (
     FleetError,
@@ -28,6 +27,15 @@ from lpac.fleet.session import (
     ssh_command,
 )
 from lpac.fleet.settings import FleetConfig, RobotHost, is_of_computer, load_fleet
+from lpac.fleet.setup import (
+    EnrolStep,
+    former_identity,
+    retire,
+    set_identity,
+    set_up_px4,
+    set_vision_hub,
+    wanted_identity,
+)
 from lpac.fleet.writer import add_robot
 
 # As ssh-copy-id does it; the key comes on standard input.
@@ -38,14 +46,6 @@ file=.ssh/authorized_keys
 while read -r key; do grep -qxF "$key" $file || echo "$key" >> $file; done
 '"""
 _LOGIN_S = 30.0
-
-
-class EnrolStep(NamedTuple):
-    """One step of enrolling: what came of it, and what there is to say about it."""
-
-    name: str
-    outcome: Literal["done", "was so already", "skipped", "left to do"]
-    notes: tuple[str, ...] = ()
 
 
 _VOXL2_URL = "udpin://127.0.0.1:14551"
@@ -83,12 +83,12 @@ async def enroll(
     robot = _robot(config, name, host, user, port, address, robot_id)
     on_step(_key(config, robot))
     async with connect(config, robot, say) as session:
-        found = (await session.call("overview", directory=config.directory))["identity"]
+        found = (await overview(session, config))["identity"]
         await lock(session, config, robot)
-        wanted = {"fleet": config.fleet, "robot": name, "robot_id": robot.robot_id}
-        if found not in (None, wanted) and not rename:
-            # The same word as the robot's, but before the file is changed.
-            await session.call("set_identity", **wanted, rename=False)
+        wanted = wanted_identity(config, robot)
+        former = former_identity(found, wanted)
+        if former is not None and not rename:
+            raise RemoteError(f"it is enrolled as {former}: if it is to be {name}, add --yes")
         was_there = name in config.robots
         if not was_there:
             add_robot(
@@ -97,19 +97,11 @@ async def enroll(
             )  # fmt: skip
             config = load_fleet(path)
             robot = config.robots[name]
-        on_step(EnrolStep(path.name, *_done(not was_there)))
-        identity = await session.call("set_identity", **wanted, rename=rename)
-        was = (f"it was {identity['former']}",) if identity["former"] else ()
-        on_step(EnrolStep("robot id", *_done(identity["changed"], was)))
+        on_step(EnrolStep.of(path.name, not was_there))
+        on_step(await set_identity(session, wanted, found))
         on_step(_card_step(config, await give_card(session, config, robot, operator)))
-        on_step(_vision_hub_step(
-            await session.call("set_vision_hub", mavlink_port=robot.mavlink_port)
-        ))  # fmt: skip
-        on_step(_predecessors_step(
-            await session.call(
-                "retire", predecessors=list(config.predecessors), mavlink_port=robot.mavlink_port
-            )
-        ))  # fmt: skip
+        on_step(await set_vision_hub(session, robot))
+        on_step(await retire(session, robot, config.predecessors, say))
     step = await _release(config, robot, say)
     on_step(step)
     if step.outcome == "left to do":
@@ -120,17 +112,9 @@ async def enroll(
     async with connect(config, robot, say) as session:
         await lock(session, config, robot)
         try:
-            report = await session.call(
-                "set_up_px4", directory=config.directory, url=robot.mavlink_url,
-                mavlink_port=robot.mavlink_port, system_id=robot.system_id,
-                rc=_value(config, robot, "failsafe", "rc"),
-                ceiling_m=_value(config, robot, "fence", "ceiling_m"),
-                command_timeout_s=_value(config, robot, "flight", "command_timeout_s", 0.5),
-            )  # fmt: skip
+            on_step(await set_up_px4(session, config, robot, say))
         except RemoteError as error:
             on_step(EnrolStep("PX4", "left to do", (f"{error}; then enroll again",)))
-            return
-        on_step(_px4_step(report))
 
 
 def _robot(
@@ -267,7 +251,7 @@ def _ssh_options(config: FleetConfig, robot: RobotHost) -> dict[str, list[str]]:
 async def _release(config: FleetConfig, robot: RobotHost, say: Say) -> EnrolStep:
     """A release without a slot's configuration, unless there is any: nothing is started by it."""
     async with connect(config, robot, say) as session:
-        if (await session.call("overview", directory=config.directory))["current"] is not None:
+        if (await overview(session, config))["current"] is not None:
             return EnrolStep("release", "was so already")
     try:
         common = load_common(config)
@@ -296,52 +280,3 @@ def _card_step(config: FleetConfig, given: CardGiven) -> EnrolStep:
             "fleet, and without it no robot joins",
         )
     return EnrolStep("card", given.outcome, notes)
-
-
-def _vision_hub_step(result: Mapping[str, Any]) -> EnrolStep:
-    if not result["there"]:
-        note = "not a VOXL2: see that PX4's MAVLink comes to this computer"
-        return EnrolStep("vision-hub", "skipped", (note,))
-    notes = tuple(result["changed"])
-    if notes and not result["restarted"]:
-        notes = (*notes, "voxl-vision-hub does not run: see `systemctl status voxl-vision-hub`")
-    return EnrolStep("vision-hub", *_done(bool(result["changed"]), notes))
-
-
-def _predecessors_step(result: Mapping[str, Any]) -> EnrolStep:
-    notes = (*(f"stopped {what}" for what in result["stopped"]), *result["suspects"])
-    if not result["saw_containers"]:
-        note = (
-            "docker does not answer, so its containers may command the vehicle: look at "
-            "`systemctl status docker` on the robot, then enroll again"
-        )
-        return EnrolStep("predecessors", "left to do", (*notes, note))
-    return EnrolStep("predecessors", *_done(bool(result["stopped"]), notes))
-
-
-def _px4_step(report: Mapping[str, Any]) -> EnrolStep:
-    notes = tuple(report["changes"])
-    if report["restarted"]:
-        notes = (*notes, f"PX4 was restarted, and answers as system {report['system_id']}")
-    if report["needs_reboot"]:
-        notes = (*notes, "some of it counts after a restart only: switch the vehicle off and on")
-    notes = (*notes, *report["problems"])
-    if report["problems"] or report["needs_reboot"]:
-        return EnrolStep("PX4", "left to do", notes)
-    return EnrolStep("PX4", *_done(bool(report["changes"]) or report["restarted"], notes))
-
-
-def _done(
-    changed: bool, notes: tuple[str, ...] = ()
-) -> tuple[Literal["done", "was so already"], tuple[str, ...]]:
-    return "done" if changed else "was so already", notes
-
-
-def _value(
-    config: FleetConfig, robot: RobotHost, table: str, key: str, default: object = None
-) -> object:
-    """Value that robot.toml would have there."""
-    value = config.values_of(robot).get(table, {}).get(key, default)
-    if value is None:
-        raise ConfigError(f"{config.path}: robot.{table}.{key} is missing")
-    return value

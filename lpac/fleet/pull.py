@@ -4,14 +4,45 @@ import asyncio
 import contextlib
 import hashlib
 import itertools
+import json
+import math
+import shlex
+import time
 from pathlib import Path
 from typing import NamedTuple
 
+from lpac.fleet.agent import LAND_UNIT, UNIT
+from lpac.fleet.deploy import lpac_inside
 from lpac.fleet.hold import Report, visit
+from lpac.fleet.program import require_disarmed
 from lpac.fleet.session import RemoteError, Session, UnreachableError, rsync
 from lpac.fleet.settings import FleetConfig, RobotHost
 
 SUMS = "SHA256SUMS"
+
+_STATE = "/var/lib/private/lpac"
+_PLACE = "/var/tmp/lpac-pull-"
+# The journal holds what was before and after a trial, too.
+_MARGIN_S = 30.0
+# Of a robot's longest call.
+_STAGE_S = 380.0
+# Modification time and path, of the flight logs and of PX4's; a laptop that has gone an hour ago
+# fetches nothing any more.
+_LIST = f"""find {_PLACE}* -maxdepth 0 -mmin +60 -exec rm -rf {{}} +
+find {_STATE}/logs -name '*.mcap' -printf '%T@ %p\\n'
+find /data/px4/log -path '*/sess*/*.ulg' -printf '%T@ %p\\n'"""
+# Large files are only linked to, so that nothing of them is copied on the robot; but those that may
+# still grow are, so that what travels is what the checksums are of.
+_STAGE = f"""set -e; umask 077; d=$(mktemp -d {_PLACE}XXXXXX); trap 'rm -rf "$d"' EXIT
+put() {{
+    [ -e "$2" ] || return 0
+    mkdir -p "$(dirname "$d/$1")"
+    if [ "$(find -L "$2" -mmin -1)" ]; then cp -pL "$2" "$d/$1"
+    else ln -s "$(realpath "$2")" "$d/$1"; fi
+}}
+"""
+
+Interval = tuple[float, float]
 
 
 class Pulled(NamedTuple):
@@ -36,26 +67,36 @@ async def pull(
     """
     folder = out.resolve() / ("all" if trial is None else trial.replace("/", "_")) / robot.name
     async with visit(config, robot, report) as (session, found):
-        collected = await session.call(
-            "collect", directory=config.directory, mavlink_port=robot.mavlink_port, trial=trial,
-            since_s=0.0 if trial is not None else _newest_s(folder),
-        )  # fmt: skip
-        if collected["folder"] is None:
-            return _nothing(config, robot, trial, folder, collected)
+        await require_disarmed(session, robot, "pulling")
+        listed = [line.split(" ", 1) for line in (await session.look({"": _LIST}))[""].splitlines()]
+        times = {path: float(time_s) for time_s, path in listed}
+        if trial is None:
+            interval, logs = (_newest_s(folder), math.inf), [path for path in times if _log(path)]
+            logs = [path for path in logs if times[path] >= interval[0]]
+        else:
+            report("reads the flight logs", None)
+            logs, flown = await _of_trial(session, config, trial, times)
+            if trial not in flown:
+                return _nothing(config, robot, trial, folder, times, list(flown))
+            interval = flown[trial]
+        ulogs = _ulogs(times, interval)
+        if trial is None and not (logs or ulogs):
+            return Pulled(str(folder), 0, 0, 0, "nothing new")
         folder.mkdir(parents=True, exist_ok=True)
-        sums: dict[str, str] = collected["files"]
+        report("checksums", None)
+        remote, sums = await _stage(session, config, trial, interval, logs, ulogs)
         try:
             report("compare", None)
-            kept = await _keep_others(session, collected["folder"], folder, sums)
+            kept = await _keep_others(session, remote, folder, sums)
             sent_bytes = await rsync(
-                config, robot, [f":{collected['folder']}/"], f"{folder}/",
+                config, robot, [f":{remote}/"], f"{folder}/",
                 options=["--copy-links", "--partial"], sudo=found["sudo"],
                 on_share=lambda share: report("fetch", share),
             )  # fmt: skip
         finally:
             # A robot out of reach removes it later by itself; the transfer's problem is to be told.
             with contextlib.suppress(UnreachableError):
-                await session.call("fetched", folder=collected["folder"])
+                await session.run("rm", "-rf", remote)
     report("check", None)
     await asyncio.to_thread(_check, folder, sums)
     _write_sums(folder, _read_sums(folder) | sums)
@@ -64,6 +105,77 @@ async def pull(
     if kept is not None:
         summary += f"; files of the same names that were here are in {kept}"
     return Pulled(str(folder), len(sums), size_bytes, sent_bytes, summary)
+
+
+def _log(path: str) -> bool:
+    return path.endswith(".mcap")
+
+
+async def _of_trial(
+    session: Session, config: FleetConfig, trial: str, times: dict[str, float]
+) -> tuple[list[str], dict[str, Interval]]:
+    """The trial's flight logs, and when each trial was flown, the newest last.
+
+    The release reads its own logs. Raises RemoteError.
+    """
+    paths = [path for path in times if _log(path)]
+    if not paths:
+        return [], {}
+    command = ("log", "trials", "/var/lib/logs", "--json")
+    done = await lpac_inside(session, f"{config.directory}/current", *command, state=_STATE)
+    if done.code != 0:
+        raise RemoteError(f"its flight logs cannot be read: {done.reason}")
+    found: dict[str, dict[str, Interval]] = json.loads(done.out)
+    flown: dict[str, list[float]] = {}
+    for of_log in found.values():
+        for name, interval in of_log.items():
+            flown.setdefault(name, []).extend(interval)
+    flown.pop("", None)
+    names = sorted(flown, key=lambda name: max(flown[name]))
+    logs = [path for path in paths if trial in found.get(path.rpartition("/")[2], {})]
+    return logs, {name: (min(flown[name]), max(flown[name])) for name in names}
+
+
+def _ulogs(times: dict[str, float], interval: Interval) -> list[str]:
+    """PX4's logs that may overlap the interval: each was begun after the one before it ended."""
+    found, began_s = [], 0.0
+    for path in sorted((p for p in times if not _log(p)), key=lambda p: (times[p], p)):
+        if times[path] >= interval[0] and began_s <= interval[1]:
+            found.append(path)
+        began_s = times[path]
+    return found
+
+
+async def _stage(
+    session: Session,
+    config: FleetConfig,
+    trial: str | None,
+    interval: Interval,
+    logs: list[str],
+    ulogs: list[str],
+) -> tuple[str, dict[str, str]]:
+    """The robot's folder to fetch, following its links, and the sha256 of each file in it."""
+    files = {f"logs/{path.rpartition('/')[2]}": path for path in logs}
+    files |= {"/".join(["px4", *path.split("/")[-2:]]): path for path in ulogs}
+    files["px4/parameters"] = "/data/px4/param/parameters"
+    for name in ("robot.toml", "versions.json"):
+        files[name] = f"{config.directory}/current/{name}"
+    journal = ["journalctl", "-u", UNIT, "-u", LAND_UNIT, "-o", "json", "--no-pager", "--quiet",
+               "--since", f"@{max(0, int(interval[0] - _MARGIN_S))}"]  # fmt: skip
+    if interval[1] < math.inf:
+        journal += ["--until", f"@{int(interval[1] + _MARGIN_S)}"]
+    name = "journal.jsonl" if trial is not None else f"journal-{int(time.time())}.jsonl"
+    script = [
+        _STAGE,
+        *(shlex.join(["put", *file]) for file in files.items()),
+        f'{shlex.join(journal)} > "$d/{name}"',
+        'cd "$d"; pwd; find -L . -type f -exec sha256sum {} +; trap - EXIT',
+    ]
+    shown = await session.must("sh", "-c", "\n".join(script), timeout_s=_STAGE_S)
+    remote, *sums = shown.splitlines()
+    return remote, {
+        path.removeprefix("./"): digest for digest, path in (s.split("  ") for s in sums)
+    }
 
 
 async def _keep_others(
@@ -81,15 +193,14 @@ async def _keep_others(
     }
     if not here:
         return None
-    beginnings = await session.call(
-        "beginnings",
-        folder=remote,
-        sizes={name: path.stat().st_size for name, path in here.items()},
-    )
+    beginnings = await session.look({
+        name: f"head -c {path.stat().st_size} {shlex.quote(f'{remote}/{name}')} | sha256sum"
+        for name, path in here.items()
+    })  # fmt: skip
     others = [
         name
         for name, path in here.items()
-        if await asyncio.to_thread(_sha256, path) != beginnings[name]
+        if not beginnings[name].startswith(await asyncio.to_thread(_sha256, path))
     ]
     if not others:
         return None
@@ -109,17 +220,14 @@ async def _keep_others(
 def _nothing(
     config: FleetConfig,
     robot: RobotHost,
-    trial: str | None,
+    trial: str,
     folder: Path,
-    collected: dict[str, object],
+    times: dict[str, float],
+    trials: list[str],
 ) -> Pulled:
     """Raises RemoteError unless that is as it should be."""
-    if trial is None:
-        return Pulled(str(folder), 0, 0, 0, "nothing new")
-    if not collected["has_logs"] and config.slot_of(robot.name) is None:
+    if not any(map(_log, times)) and config.slot_of(robot.name) is None:
         return Pulled(str(folder), 0, 0, 0, "a spare that never flew")
-    trials = collected["trials"]
-    assert isinstance(trials, list)
     flown = f"it has {', '.join(map(repr, trials[-5:]))}" if trials else "it has none at all"
     raise RemoteError(f"it has nothing of trial {trial!r}; {flown}")
 

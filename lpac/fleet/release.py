@@ -1,12 +1,14 @@
 """Release: image, policy, world, configuration, unit and lock of versions, sent as one.
 
-A release is named by its content: the first 16 hexadecimal digits of its manifest's sha256.
+A release is named by its content: the first 16 hexadecimal digits of the sha256 of its manifest,
+which has the hash of every file. On a robot it lies in a folder that its number names.
 """
 
 import hashlib
 import json
 import os
 import stat
+import time
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -46,23 +48,20 @@ class Image:
 class Release(NamedTuple):
     """One robot's release: the image beside it, all else in `folder`, ready to travel.
 
-    `manifest_sha256` is its content's name in full, in hexadecimal.
+    `number` is greater than that of any release before.
     """
 
-    manifest_sha256: str
+    id: str
+    number: int
     image: Image
     folder: Path
     size_bytes: int
 
-    @property
-    def id(self) -> str:
-        """Its name."""
-        return self.manifest_sha256[:16]
-
 
 class Common(NamedTuple):
-    """Parts that the releases of a fleet share, checked."""
+    """Parts that the releases of a fleet share, checked, and their number: the time, Unix s."""
 
+    number: int
     image: Image
     bundle: Bundle
     world: bytes
@@ -77,7 +76,7 @@ def load_common(config: FleetConfig) -> Common:
     if bundle.manifest.perception is None:
         raise ReleaseError(f"{config.bundle}: the bundle has no perception: it cannot fly")
     units = {unit.name: unit.read_bytes() for unit in _UNITS}
-    return Common(load_image(config.image), bundle, world, units)
+    return Common(int(time.time()), load_image(config.image), bundle, world, units)
 
 
 def load_image(folder: Path) -> Image:
@@ -134,7 +133,8 @@ def make_release(config: FleetConfig, robot: RobotHost, common: Common, folder: 
     (folder / "manifest.json").write_bytes(manifest)
     (folder / "manifest.json").chmod(0o644)
     size_bytes = common.image.size_bytes + len(manifest) + sum(map(len, files.values()))
-    return Release(hashlib.sha256(manifest).hexdigest(), common.image, folder, size_bytes)
+    name = hashlib.sha256(manifest).hexdigest()[:16]
+    return Release(name, common.number, common.image, folder, size_bytes)
 
 
 def drop_ins(config: FleetConfig, robot: RobotHost) -> dict[str, str]:
@@ -168,7 +168,7 @@ def drop_ins(config: FleetConfig, robot: RobotHost) -> dict[str, str]:
 
 
 def _entry(path: Path, info: os.stat_result) -> Entry:
-    """As `lpac.fleet.on_robot.releases` reads it there."""
+    """As `lpac.fleet.agent.check` reads it there."""
     if stat.S_ISLNK(info.st_mode):
         return "link", str(path.readlink())
     with path.open("rb") as file:

@@ -9,11 +9,14 @@ import contextlib
 import json
 import re
 import shlex
-from collections.abc import AsyncIterator, Callable, Sequence
+from base64 import b64encode
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from edge.drivers.px4 import raw_mavlink
+from lpac.fleet import agent
+from lpac.fleet.on_robot import enrolment
 from lpac.fleet.settings import FleetConfig, RobotHost
 
 Say = Callable[[str], None]
@@ -21,18 +24,8 @@ Say = Callable[[str], None]
 _PING_S = 3.0
 # Of one call: the longest is the policy's verification on a slow CPU.
 _CALL_S = 400.0
-# In the order in which they are loaded.
-_PACKAGES = (
-    "edge",
-    "edge.drivers",
-    "edge.drivers.px4",
-    "lpac",
-    "lpac.fleet",
-    "lpac.fleet.on_robot",
-)
-_MODULES = (
-    "calls", "service", "signatures", "releases", "probes", "enrolment", "collection", "landing",
-)  # fmt: skip
+# Between the parts of what `look` has printed.
+_BETWEEN = "\x1e"
 # Reads the modules' sources, makes them modules, and serves. The login shell sees but this.
 _BOOTSTRAP = """
 import json, os, sys, types
@@ -43,10 +36,8 @@ while len(data) < {size}:
     data += part
 for name, source in json.loads(data.decode()):
     module = sys.modules[name] = types.ModuleType(name)
-    parent, _, child = name.rpartition(".")
-    if parent: setattr(sys.modules[parent], child, module)
     exec(compile(source, name, "exec"), module.__dict__)
-sys.modules["lpac.fleet.on_robot.calls"].serve()
+sys.modules["lpac.fleet.agent"].serve()
 """
 # What ssh and rsync say of a robot, and what that means for a person.
 _ADVICE = (
@@ -110,8 +101,22 @@ def explain(text: str, host: str) -> str:
     return lines[-1] if lines else "it does not answer any more: it is off, or out of reach"
 
 
+class Done(NamedTuple):
+    """A program's exit code, and what it wrote."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def reason(self) -> str:
+        """The last line with which it complained, else its exit code."""
+        lines = [line.strip() for line in self.err.splitlines() if line.strip()]
+        return lines[-1] if lines else f"exit code {self.code}"
+
+
 class Session:
-    """Calls to the functions of `lpac.fleet.on_robot` on one robot. For one task at a time."""
+    """Calls to the functions of `lpac.fleet.agent` on one robot. For one task at a time."""
 
     def __init__(self, robot: RobotHost, process: asyncio.subprocess.Process, say: Say) -> None:
         assert process.stdin is not None and process.stdout is not None
@@ -149,6 +154,27 @@ class Session:
                 f"its login shell prints {line[:60]!r}: let ~/.bashrc be silent for ssh"
             ) from None
         raise UnreachableError(explain(await self._all_complaints(), self.robot.host))
+
+    async def run(self, *command: str, timeout_s: float = 60.0) -> Done:
+        """Run a program as root, whatever its exit code. Raises as `call`."""
+        return Done(**await self.call("run", command=command, timeout_s=timeout_s))
+
+    async def must(self, *command: str, timeout_s: float = 60.0) -> str:
+        """Output of a program. Raises RemoteError unless it returns 0; else as `call`."""
+        done = await self.run(*command, timeout_s=timeout_s)
+        if done.code != 0:
+            raise RemoteError(f"{shlex.join(command)}: {done.reason}")
+        return done.out
+
+    async def look(self, commands: Mapping[str, str]) -> dict[str, str]:
+        """What shell commands print, by name, without complaints; in one call."""
+        lines = [f"( {command}\n) 2>/dev/null; printf '\\036'" for command in commands.values()]
+        shown = await self.run("sh", "-c", "\n".join(["export LC_ALL=C", *lines]))
+        return dict(zip(commands, map(str.strip, shown.out.split(_BETWEEN)), strict=False))
+
+    async def write(self, path: str, content: bytes, mode: int = 0o644) -> None:
+        """Write a file of root's, whole or not at all. Raises as `call`."""
+        await self.call("write", path=path, content=b64encode(content).decode(), mode=mode)
 
     async def close(self) -> None:
         """End the conversation; locks that it held are free then."""
@@ -191,13 +217,8 @@ async def connect(
     config: FleetConfig, robot: RobotHost, say: Say = lambda _: None
 ) -> AsyncIterator[Session]:
     """A session; `say` hears how far calls are. Raises UnreachableError."""
-    folder = Path(__file__).parent / "on_robot"
-    sources = [(name, "") for name in _PACKAGES]
-    sources.append((raw_mavlink.__name__, Path(raw_mavlink.__file__).read_text("utf-8")))
-    sources += [
-        (f"lpac.fleet.on_robot.{name}", (folder / f"{name}.py").read_text("utf-8"))
-        for name in _MODULES
-    ]
+    modules = (raw_mavlink, agent, enrolment)
+    sources = [(m.__name__, Path(str(m.__file__)).read_text("utf-8")) for m in modules]
     payload = json.dumps(sources).encode()
     # Python 3.6 would take the robot's texts for ASCII.
     python = f"env LC_ALL=C.UTF-8 python3 -u -c {shlex.quote(_BOOTSTRAP.format(size=len(payload)))}"

@@ -8,7 +8,8 @@ from typing import NamedTuple
 from edge.core.schema import ConfigError
 from lpac.fleet.cards import give_card
 from lpac.fleet.deploy import Deployed, deploy
-from lpac.fleet.hold import Report, check_identity, hold
+from lpac.fleet.hold import Report, check_identity, hold, overview
+from lpac.fleet.program import stop
 from lpac.fleet.release import load_common, make_release
 from lpac.fleet.session import RemoteError, UnreachableError, connect
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet, select
@@ -84,15 +85,13 @@ async def _stop(config: FleetConfig, robot: RobotHost) -> str | None:
     """
     try:
         async with connect(config, robot) as session:
-            found = await session.call("overview", directory=config.directory)
+            found = await overview(session, config)
             try:
                 check_identity(found["identity"], config, robot)
             except RemoteError as error:
                 return str(error)
             # Without the lock: on a robot that is broken it may not be had.
-            await session.call(
-                "stop", mavlink_port=robot.mavlink_port, in_flight=False, disable=True
-            )
+            await stop(session, robot, in_flight=False, disable=True)
     except UnreachableError as error:
         return str(error)
     return None

@@ -4,7 +4,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from edge.core.wire import PayloadType
 from edge.drivers.registry import load_policy
@@ -23,10 +23,13 @@ from lpac.fleet.doctor import (
 )
 from lpac.fleet.hold import Report, lock, visit
 from lpac.fleet.operations import Outcome
+from lpac.fleet.program import require_disarmed, start
 from lpac.fleet.session import RemoteError, Session, UnreachableError
 from lpac.fleet.settings import FleetConfig, RobotHost
 
 _ASK_AGAIN_S = 1.0
+# As `edge.drivers.identity_folder` writes it, and `edge.identity.guard` refuses it.
+_START, _MOST_AHEAD_MS = "/var/lib/private/lpac/identity/start", 24 * 3600 * 1000
 # Of what goes to a group by Wi-Fi, where the receiver is neither near nor far.
 _LOST = 0.05
 
@@ -122,46 +125,68 @@ async def _bring_up(
 ) -> Arrival:
     done: list[str] = []
     problems: list[str] = []
-
-    async def step(function: str, **arguments: object) -> dict[str, Any]:
-        try:
-            return await session.call(function, **arguments)
-        except RemoteError as error:
-            problems.append(str(error))
-            return {}
-
-    locked = False
+    locked = is_right = False
     try:
         recovered = await lock(session, config, robot)
         locked = True
-        if recovered is not None:
-            done.append(recovered)
+        done += [recovered] if recovered is not None else []
     except RemoteError as error:
         problems.append(str(error))
-    clock = await measure_clock(session, unix_time_s)
-    is_right = abs(clock.offset_s) <= GOOD_CLOCK_OFFSET_S + clock.uncertainty_s
-    if not is_right:
-        port = robot.mavlink_port
-        if await step("set_clock", offset_s=clock.offset_s, mavlink_port=port):
+    try:
+        clock = await measure_clock(session, unix_time_s)
+        is_right = abs(clock.offset_s) <= GOOD_CLOCK_OFFSET_S + clock.uncertainty_s
+        if not is_right:
+            await set_clock(session, robot, clock.offset_s)
             done.append(f"its clock was set by {-clock.offset_s:+.2f} s")
             is_right = True
-    if is_right and (await step("renumber_starts")).get("ahead"):
+    except RemoteError as error:
+        problems.append(str(error))
+    if is_right and await renumber_starts(session):
         problems.append(
             "its program started by a clock more than a day ahead, and is not listened to: "
             f"`lpac fleet restart --robots {robot.name}`"
         )
-    if locked and has_group_keys(config):
-        try:
-            if await give_group_keys(session, config, robot):
-                done.append("it was given a new key of the group")
-        except RemoteError as error:
-            problems.append(str(error))
-    service = await session.call("service")
-    flies = config.slot_of(robot.name) is not None
-    idle = flies and locked and service["enabled"] and service["active"] != "active"
-    if idle and await step("start", directory=config.directory):
-        done.append("its program was started")
+    if not locked:
+        return Arrival(tuple(done), tuple(problems))
+    try:
+        if has_group_keys(config) and await give_group_keys(session, config, robot):
+            done.append("it was given a new key of the group")
+        service = await session.call("service")
+        idle = service["enabled"] and service["active"] != "active"
+        if idle and config.slot_of(robot.name) is not None:
+            await start(session, config)
+            done.append("its program was started")
+    except RemoteError as error:
+        problems.append(str(error))
     return Arrival(tuple(done), tuple(problems))
+
+
+async def set_clock(session: Session, robot: RobotHost, offset_s: float) -> None:
+    """Take `offset_s` off the wall clock at once, and set the battery-backed clock if there is one.
+
+    Refused while the vehicle is armed. On the ground the program may run meanwhile: it counts
+    monotonic time. Only the flight log's times jump as the clock does. Raises RemoteError.
+    """
+    await require_disarmed(session, robot, "setting the clock")
+    set_it = f"import time as t; t.clock_settime(0, t.clock_gettime(0) - {offset_s!r})"
+    if (await session.run("python3", "-c", set_it)).code != 0:
+        raise RemoteError(
+            "its clock cannot be set: the system does not let root do that (a container?)"
+        )
+    await session.run("sh", "-c", "ls /dev/rtc* && hwclock -w")
+
+
+async def renumber_starts(session: Session) -> bool:
+    """Number the program's starts by the clock again if the last was more than a day ahead of it.
+
+    Nobody listens to such a start. The clock must be right. Whether it was ahead.
+    """
+    said = await session.look({"start": f"cat {_START}", "now": "date +%s%3N"})
+    if not said["start"].isdigit() or int(said["start"]) <= int(said["now"]) + _MOST_AHEAD_MS:
+        return False
+    # In place: it is the program's user's.
+    await session.must("sh", "-c", f"echo {said['now']} > {_START}")
+    return True
 
 
 def board(

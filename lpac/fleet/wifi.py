@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lpac.fleet import probes
 from lpac.fleet.hold import Report
 from lpac.fleet.session import UnreachableError, connect, explain, ssh_command
 from lpac.fleet.settings import FleetConfig, RobotHost
@@ -23,12 +24,11 @@ Interface = Mapping[str, Any]
 
 
 async def read_wifi(config: FleetConfig, robot: RobotHost, report: Report) -> list[Interface]:
-    """Its wireless interfaces as they are now (`probes.wifi`). Raises FleetError."""
+    """Its wireless interfaces as they are now (`probes.wifi_of`). Raises FleetError."""
     report("connect", None)
     async with connect(config, robot) as session:
         report("radio", None)
-        interfaces: list[Interface] = (await session.call("wifi"))["interfaces"]
-        return interfaces
+        return [*await probes.wifi(session)]
 
 
 def in_the_wifi(address: str, root: Path = Path("/")) -> bool:

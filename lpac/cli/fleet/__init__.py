@@ -13,7 +13,7 @@ from lpac.cli.fleet.everyday import (
     start,
     stop,
 )
-from lpac.cli.fleet.field import doctor, ping, up
+from lpac.cli.fleet.field import doctor, up
 from lpac.cli.fleet.keys import init, members, operator, revoke, rotate
 from lpac.cli.fleet.membership import enroll, pull, swap
 from lpac.cli.fleet.radio import radio
@@ -22,7 +22,7 @@ from lpac.cli.fleet.status import status
 app = new_app("fleet", "Deploy to the robots, start and stop them.")
 _COMMANDS: tuple[Callable[..., None], ...] = (
     deploy, rollback, start, stop, restart, land, status, logs,
-    doctor, up, ping, radio, enroll, swap, pull, init, operator, members, revoke, rotate,
+    doctor, up, radio, enroll, swap, pull, init, operator, members, revoke, rotate,
 )  # fmt: skip
 for command in _COMMANDS:
     app.command()(command)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from lpac.fleet.deploy import Deployed
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
+    from lpac.fleet.session import Session
     from lpac.fleet.settings import FleetConfig, RobotHost
 
 T = TypeVar("T")
@@ -115,9 +116,11 @@ class _Controlled(NamedTuple):
 
 def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
     """Start the robots' programs, now and at every boot. Nothing takes off by that."""
+    from lpac.fleet import program
+
     config, chosen = open_fleet(fleet, robots)
     chosen = _without_spares(config, chosen, "started")
-    _control(config, chosen, "start", "started on", as_json, directory=config.directory)
+    _control(config, chosen, "start", lambda at, _: program.start(at, config), as_json)
 
 
 @options_of(OfFleet)
@@ -126,19 +129,28 @@ def stop(of: OfFleet, *, in_flight: InFlight = False) -> None:
 
     A robot in flight refuses.
     """
+    from lpac.fleet import program
+
     config, chosen = open_fleet(of.fleet, of.robots)
-    _control(config, chosen, "stop", "stopped on", of.as_json, in_flight=in_flight, disable=True)
+    _control(
+        config, chosen, "stop",
+        lambda at, robot: program.stop(at, robot, in_flight=in_flight, disable=True), of.as_json,
+    )  # fmt: skip
 
 
 @options_of(OfFleet)
 def restart(of: OfFleet, *, in_flight: InFlight = False) -> None:
     """Stop the robots' programs and start them again. A robot in flight refuses."""
+    from lpac.fleet import program
+
     config, chosen = open_fleet(of.fleet, of.robots)
     chosen = _without_spares(config, chosen, "restarted")
-    _control(
-        config, chosen, "restart", "restarted on", of.as_json,
-        directory=config.directory, in_flight=in_flight,
-    )  # fmt: skip
+
+    async def again(session: "Session", robot: "RobotHost") -> None:
+        await program.stop(session, robot, in_flight=in_flight, disable=False)
+        await program.start(session, config)
+
+    _control(config, chosen, "restart", again, of.as_json)
 
 
 def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
@@ -146,49 +158,47 @@ def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = 
 
     Refused while the program runs (use `lpac mission land`) and while a pilot flies.
     """
+    from lpac.fleet import program
     from lpac.fleet.hold import visit
 
     config, chosen = open_fleet(fleet, robots)
 
     async def one(robot: "RobotHost", report: "Report") -> dict[str, Any]:
         async with visit(config, robot, report) as (session, _):
-            return await session.call(
-                "land", mavlink_port=robot.mavlink_port, system_id=robot.system_id
-            )
+            return await program.land(session, robot, report)
 
     tell(
-        config, run_for_each(chosen, one), "landing:", as_json=as_json, describe=dict,
+        config, run_for_each(chosen, one), "landing:", as_json=as_json,
+        describe=lambda v: {"mode": v["mode"], "armed": v["armed"]},
         cells=lambda v: (styled("it lands" if v["armed"] else "it has landed", GOOD),),
     )  # fmt: skip
+
+
+_DONE = {"start": "started on", "stop": "stopped on", "restart": "restarted on"}
 
 
 def _control(
     config: "FleetConfig",
     robots: Sequence["RobotHost"],
-    function: str,
-    done: str,
+    step: str,
+    change: Callable[["Session", "RobotHost"], Awaitable[None]],
     as_json: bool,
-    **arguments: object,
 ) -> None:
-    """Call a function that changes the unit on all robots, hold them for that, print it.
-
-    One that is told `in_flight` needs the vehicle's port too.
-    """
+    """Change the unit on all robots, hold them for that, print it."""
     from lpac.fleet.hold import hold
 
     async def one(robot: "RobotHost", report: "Report") -> _Controlled:
-        port = {"mavlink_port": robot.mavlink_port} if "in_flight" in arguments else {}
-        async with hold(config, robot, report) as held:
-            report(function, None)
-            service = await held.session.call(function, **arguments, **port)
-            return _Controlled(held.found["current"], service, held.recovered)
+        async with hold(config, robot, report) as (session, found, recovered):
+            report(step, None)
+            await change(session, robot)
+            return _Controlled(found["current"], await session.call("service"), recovered)
 
     outcomes = run_for_each(robots, one)
     for outcome in outcomes:
         if outcome.value and outcome.value.recovered and not as_json:
             typer.echo(f"{outcome.robot.name}: {outcome.value.recovered}")
     tell(
-        config, outcomes, done, as_json=as_json, describe=_Controlled._asdict,
+        config, outcomes, _DONE[step], as_json=as_json, describe=_Controlled._asdict,
         headings=("release", "flight"),
         cells=lambda v: ((v.release or "")[:SHORT], flight(v.service), program(v.service)),
     )  # fmt: skip

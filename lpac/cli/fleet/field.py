@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lpac.cli.fields import options_of
-from lpac.cli.fleet.progress import print_json, print_problems, require_all, run_for_each
+from lpac.cli.fleet.progress import run_for_each
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots, open_fleet
 from lpac.cli.printing import BAD, FAINT, GOOD, NOTABLE, print_notes, print_table, styled
 
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from lpac.fleet.doctor import Diagnosis, Examination, Round
+    from lpac.fleet.doctor import Diagnosis, Examination
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
     from lpac.fleet.settings import FleetConfig, RobotHost
@@ -237,69 +237,6 @@ def _print_decisions(decisions: "Sequence[GoDecision]", batteries: "Mapping[str,
     rows.append(("fleet", go, "", least, ""))
     typer.echo()
     print_table(("robot", "", "battery", "trials", "why"), rows, ("battery", "trials"))
-
-
-# ping
-
-
-def ping(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
-    """Measure the radio: from here to each robot over SSH, and between the robots by ICMP."""
-    from lpac.fleet.doctor import measure_radio
-
-    config, chosen = open_fleet(fleet, robots)
-
-    async def one(robot: "RobotHost", report: "Report") -> "Round":
-        others = [other for other in chosen if other is not robot]
-        return await measure_radio(config, robot, others, report)
-
-    outcomes = run_for_each(chosen, one)
-    if as_json:
-        print_json(config, outcomes, lambda found: found._asdict())
-    else:
-        _print_matrix(outcomes)
-        print_problems(outcomes)
-    deaf = sorted(
-        f"{outcome.robot.name} → {other}"
-        for outcome in outcomes
-        if outcome.value is not None and not isinstance(outcome.value.others, str)
-        for other, found in outcome.value.others.items()
-        if found["loss"] >= 1.0
-    )
-    if deaf:
-        raise ValueError(f"no answer: {', '.join(deaf)}")
-    require_all(outcomes, "reached")
-
-
-def _print_matrix(outcomes: "Sequence[Outcome[Round]]") -> None:
-    """A row for each robot that asks, ms there and back to each other one, and losses."""
-    names = [outcome.robot.name for outcome in outcomes]
-    rows: list[list[str | Text]] = []
-    for outcome in outcomes:
-        if outcome.value is None:
-            rows.append([outcome.robot.name, styled("-", BAD), *("" for _ in names)])
-            continue
-        to_others = outcome.value.others
-        rows.append([
-            outcome.robot.name,
-            f"{outcome.value.laptop_ms:.1f}",
-            *(
-                styled(to_others, FAINT)
-                if isinstance(to_others, str)
-                else _way(to_others.get(name))
-                for name in names
-            ),
-        ])  # fmt: skip
-    print_table(("ms", "laptop", *names), rows, ("laptop", *names))
-
-
-def _way(found: "Mapping[str, Any] | None") -> "str | Text":
-    if found is None:
-        return ""
-    if found["loss"] >= 1.0:
-        return styled("lost", BAD)
-    if found["loss"] > 0.0:
-        return styled(f"{found['mean_ms']:.1f} ({100.0 * found['loss']:.0f} % lost)", NOTABLE)
-    return f"{found['mean_ms']:.1f}"
 
 
 def _echo(config: "FleetConfig", robots: dict[str, Any]) -> None:

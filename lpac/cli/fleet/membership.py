@@ -85,8 +85,8 @@ def enroll(of: EnrolOptions) -> None:
 
 def _enroll(name: str, of: EnrolOptions) -> list[str]:
     """Print each step; those that are left to do."""
-    from lpac.fleet.enroll import EnrolStep
     from lpac.fleet.enroll import enroll as enroll_robot
+    from lpac.fleet.setup import EnrolStep
 
     left: list[str] = []
 

@@ -1,8 +1,7 @@
 """`lpac fleet status`: the state of each robot, and its wording."""
 
 import time
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lpac.cli.fleet.progress import print_json, require_all, run_for_each
@@ -87,14 +86,14 @@ def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) ->
     """The table of the fleet, and notes on what is not as it should be."""
     states = {o.robot.name: o.value for o in outcomes if o.value is not None}
     parts = {name: _parts(state.overview["versions"]) for name, state in states.items()}
-    most = _most_common(text for text in parts.values() if text is not None)
-    odd = {name: text for name, text in parts.items() if text not in (None, most)}
+    newest = max(states, key=lambda name: _number_of(states[name]), default="")
+    behind = {name: text for name, text in parts.items() if text not in (None, parts[newest])}
     silent = ["", styled("see below", BAD), *[""] * (len(_HEADINGS) - 4)]
     rows = []
     for robot, state, *_ in outcomes:
         slot = _slot(config, robot.name)
         place = styled("spare", FAINT) if slot is None else str(slot)
-        cells = silent if state is None else _cells(state, robot.name in odd)
+        cells = silent if state is None else _cells(state, robot.name in behind)
         rows.append([robot.name, place, *cells])
     print_table(_HEADINGS, rows, _NUMBERS)
     notes: list[tuple[str, str | Text]] = []
@@ -103,16 +102,18 @@ def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) ->
             notes.append((outcome.robot.name, styled(outcome.problem, BAD)))
         if outcome.value is not None:
             notes += [(outcome.robot.name, note) for note in _notes(outcome.value)]
-        if outcome.robot.name in odd:
-            notes.append((outcome.robot.name, styled(f"* {odd[outcome.robot.name]}", NOTABLE)))
+        if outcome.robot.name in behind and outcome.value is not None:
+            has = f"{_date(outcome.value)}: {behind[outcome.robot.name]}"
+            notes.append((outcome.robot.name, styled(f"* behind {newest}: {has}", NOTABLE)))
         if outcome.value is not None and outcome.value.is_configured is False:
             note = (
                 f"* its configuration is not the one of {config.path.name}: lpac fleet deploy "
                 f"--robots {outcome.robot.name}"
             )
             notes.append((outcome.robot.name, styled(note, NOTABLE)))
-    if most is not None:
-        notes.append(("others" if odd else "all", most))
+    if parts.get(newest):
+        label = "newest" if behind else "all"
+        notes.append((label, f"{_date(states[newest])}: {parts[newest]}"))
     print_notes(notes)
 
 
@@ -134,10 +135,10 @@ def flight(service: Mapping[str, Any]) -> str:
     return str(service["status"].get("state", "")) if service["fresh"] else ""
 
 
-def _cells(state: State, odd: bool) -> list["str | Text"]:
+def _cells(state: State, behind: bool) -> list["str | Text"]:
     overview, service = state.overview, state.overview["service"]
     said = service["status"] if service["fresh"] else {}
-    marks = ("*" if odd or state.is_configured is False else "") + (
+    marks = ("*" if behind or state.is_configured is False else "") + (
         "?" if overview["pending"] else ""
     )
     armed = said.get("armed")
@@ -162,7 +163,7 @@ def _notes(state: State) -> list["str | Text"]:
     if pending:
         notes.append(
             styled(
-                f"? a switch to {pending['release'][:SHORT]} is not confirmed yet: unless "
+                f"? a switch to {pending[:SHORT]} is not confirmed yet: unless "
                 "somebody deploys, deploy again",
                 NOTABLE,
             )
@@ -193,10 +194,13 @@ def _parts(versions: Mapping[str, Any] | None) -> str | None:
     return ", ".join(f"{name} {str(versions.get(name))[:SHORT]}" for name in names)
 
 
-def _most_common(texts: Iterable[str]) -> str | None:
-    """Text of more than half of them; None if there is none."""
-    counts = Counter(texts)
-    return next((text for text, n in counts.items() if 2 * n > counts.total()), None)
+def _number_of(state: State) -> int:
+    """Of the robot's release: the greater, the later it was made. It is the Unix time, s."""
+    return int(state.overview["number"] or 0)
+
+
+def _date(state: State) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(_number_of(state)))
 
 
 def _duration(seconds: float) -> str:

@@ -90,10 +90,11 @@ def give_image(host: FrailHost, image: Image, image_id: str | None = None) -> No
 
     With an `image_id` of another image: only the files are the same.
     """
-    earlier = host.root / "opt/lpac/releases/earlier"
+    earlier = host.root / "opt/lpac/releases/1"
     if not earlier.parent.exists():
         shutil.copytree(image.folder, earlier / "root", symlinks=True)
         (earlier / "versions.json").write_text(json.dumps({"image": image_id or image.id}))
+        (earlier / "manifest.json").write_text("{}")
 
 
 def deploy_to(

@@ -2,16 +2,19 @@
 
 import asyncio
 import time
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from lpac.fleet.deploy import Deployed, deploy, rollback
-from lpac.fleet.hold import Report, hold
+from lpac.fleet.hold import Report, lock, overview
 from lpac.fleet.release import Common, Release, load_common, make_release
-from lpac.fleet.session import connect
+from lpac.fleet.session import Session, connect
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
 from tests.host.fleet.field import unwatched
 from tests.host.hosts import FrailHosts
+
+T = TypeVar("T")
 
 
 class Laptop:
@@ -37,10 +40,17 @@ class Laptop:
         release = release or self.release(index)
         return asyncio.run(deploy(self.config, self.robot(index), release, report))
 
-    def call(self, index: int, function: str, **arguments: object) -> dict[str, Any]:
-        async def one() -> dict[str, Any]:
-            async with connect(self.config, self.robot(index)) as session:
-                return await session.call(function, **arguments)
+    def ask(
+        self, index: int, question: Callable[[Session, RobotHost], Awaitable[T]], held: bool = False
+    ) -> T:
+        """What comes of it in a session, which has the lock if `held`."""
+
+        async def one() -> T:
+            robot = self.robot(index)
+            async with connect(self.config, robot) as session:
+                if held:
+                    await lock(session, self.config, robot)
+                return await question(session, robot)
 
         return asyncio.run(one())
 
@@ -48,7 +58,7 @@ class Laptop:
         """What the robot has; a busy machine may hold up for a moment what its program says."""
         until_s = time.monotonic() + 60.0
         while True:
-            found = self.call(index, "overview", directory=self.config.directory)
+            found = self.ask(index, lambda session, _: overview(session, self.config))
             service = found["service"]
             if service["fresh"] or service["active"] != "active" or time.monotonic() > until_s:
                 return found
@@ -57,19 +67,6 @@ class Laptop:
         """The same with another world file: a release that differs in one file, and versions."""
         world = self.common.world + b"CircularBND 100 100 20 %.9f\n" % time.monotonic()
         return self.common._replace(world=world)
-
-    def switch(self, index: int, release: Release) -> None:
-        """What a session may ask for that keeps to no order of steps."""
-        robot, directory = self.robot(index), self.config.directory
-
-        async def one() -> None:
-            async with hold(self.config, robot) as held:
-                await held.session.call(
-                    "switch", directory=directory, release=release.id,
-                    mavlink_port=robot.mavlink_port,
-                )  # fmt: skip
-
-        asyncio.run(one())
 
     def roll_back(self, index: int) -> str:
         return asyncio.run(rollback(self.config, self.robot(index), unwatched))

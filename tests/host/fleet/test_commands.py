@@ -205,7 +205,7 @@ def test_a_robot_that_is_off_is_named_and_the_others_do_it(operator: Operator) -
         f"r2  {SILENT}", "lpac: succeeded on 1 of 2 robots; failed: r2",
     ]  # fmt: skip
 
-    assert "* image" in operator("status").stdout  # r1 has another world than the others
+    assert "* behind r1" in operator("status").stdout  # which alone has the new world
     assert operator.json("rollback", "--robots", "r1") == {
         "r1": {"host": operator.hosts[0].address, "problem": None, "release": before}
     }

@@ -133,21 +133,6 @@ def test_doctor_prints_a_board_and_fails(enrolled: FrailHosts) -> None:
     assert hub["fix"].startswith("lpac fleet enroll r1")
 
 
-def test_ping_has_every_way(enrolled: FrailHosts) -> None:
-    shown = lpac_fleet(enrolled.fleet_toml, "ping", "--json")
-    assert shown.returncode == 0, shown.stderr
-    robots = json.loads(shown.stdout)["robots"]
-    for name, found in robots.items():
-        assert found["laptop_ms"] > 0.0
-        assert set(found["others"]) == set(robots) - {name}
-        assert all(way["loss"] < 1.0 for way in found["others"].values())
-    with deaf(enrolled[0], enrolled[2]):
-        shown = lpac_fleet(enrolled.fleet_toml, "ping")
-    assert shown.returncode == 1
-    assert shown.stderr.splitlines()[-1] == "lpac: no answer: r1 → r3, r3 → r1"
-    assert "lost" in shown.stdout
-
-
 def test_up_says_no_go_with_the_reasons(enrolled: FrailHosts) -> None:
     enrolled[2].cut()
     try:

@@ -1,6 +1,7 @@
 """What `lpac fleet` prints: lines of a journal, and the table of robots."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,13 @@ def test_what_is_no_journal_is_said() -> None:
         parse_entry("bash: nonsense")
 
 
+def date(unix_time_s: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(unix_time_s))
+
+
+NEWEST = date(1796000000)
+
+
 @pytest.fixture
 def fleet(tmp_path: Path) -> FleetConfig:
     return load_fleet(write_fleet(tmp_path, 22, flying=10, spares=1))
@@ -115,7 +123,8 @@ def overview(**changes: Any) -> dict[str, Any]:
     } | changes.pop("service", {})  # fmt: skip
     versions = {"image": "1" * 16, "bundle": "2" * 64, "world": "3" * 12}
     return {
-        "current": "0123456789abcdef", "pending": None, "versions": versions, "service": service,
+        "current": "0123456789abcdef", "number": "1796000000", "pending": None,
+        "versions": versions, "service": service,
     } | changes  # fmt: skip
 
 
@@ -155,7 +164,7 @@ def test_ten_robots_fit_the_terminal(
     assert rows[10] == ["r11", "spare", "see", "below"]
     assert [line.split(maxsplit=1) for line in notes] == [
         ["r11", "it does not answer [or so]"],
-        ["all", "image 11111111, bundle 22222222, world 33333333"],
+        ["all", f"{NEWEST}: image 11111111, bundle 22222222, world 33333333"],
     ]
 
 
@@ -163,13 +172,13 @@ def test_what_is_not_as_it_should_be_is_noted(
     fleet: FleetConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "100")
-    other = overview()
+    other = overview(number=str(1796000000 - 60))
     other["versions"] |= {"world": "4" * 12}
     failed = {"active": "failed", "result": "exit-code", "fresh": False, "restarts": 5}
     never = {"active": "inactive", "installed": False, "fresh": False, "status": None}
     states: list[State | None] = [
         State(overview(), 0, 0.0, None),
-        State(overview(pending={"release": "fedcba9876543210", "former": None}), 1, -70.0, None),
+        State(overview(pending="fedcba9876543210"), 1, -70.0, None),
         State(other, 2, 0.0, None),
         State(overview(service=failed), 3, 0.0, "lpac: no such file"),
         State(overview(current=None, versions=None, service=never), 4, 0.0, None),
@@ -180,9 +189,11 @@ def test_what_is_not_as_it_should_be_is_noted(
     assert rows[2][2] == "01234567*"
     assert rows[3][2:] == ["01234567", "failed", "+0.0"]
     assert rows[4][2:] == ["none", "none", "+0.0"]
-    assert [line.split()[0] for line in notes] == ["r2", "r3", "r4", "r4", "others"]
+    assert [line.split()[0] for line in notes] == ["r2", "r3", "r4", "r4", "newest"]
     assert "fedcba98 is not confirmed yet" in notes[0]
-    assert notes[1].split("*")[1].strip() == "image 11111111, bundle 22222222, world 44444444"
+    before = date(1796000000 - 60)
+    parts = "image 11111111, bundle 22222222, world 44444444"
+    assert notes[1].split("*")[1].strip() == f"behind r1: {before}: {parts}"
     assert notes[2].endswith("lpac: no such file")
     assert "restarted 5 times" in notes[3]
 

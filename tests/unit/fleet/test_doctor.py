@@ -407,7 +407,7 @@ def test_the_vehicle_is_asked_only_where_nothing_speaks_against_it(config: Fleet
         changed = copy.deepcopy(facts)
         change(changed)
         session: Any = Silent()
-        asked = _check_vehicle(config, config.robots["r1"], session, changed)
+        asked = _check_vehicle(config, config.robots["r1"], session, changed, lambda *_: None)
         assert asyncio.run(asked) == why
 
 
@@ -416,8 +416,8 @@ def test_the_quickest_exchange_tells_the_clock() -> None:
     times_s = iter([0.0, 5.3, 0.4, 1.0, 6.01, 1.02, 2.0, 7.1, 2.3, 3.0, 8.1, 3.3, 4.0, 9.1, 4.3])
 
     class Asked:
-        async def call(self, function: str) -> dict[str, float]:
-            return {"unix_time_s": next(times_s)}
+        async def must(self, *_: str) -> str:
+            return f"{next(times_s)}\n"
 
     session: Any = Asked()
     assert asyncio.run(measure_clock(session, lambda: next(times_s))) == pytest.approx((5.0, 0.01))

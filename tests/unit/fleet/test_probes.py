@@ -1,9 +1,9 @@
-"""What the robot's tools print, read on the robot: any numbers and names, cut off anywhere."""
+"""What the robot's tools print, parsed: any numbers and names, cut off anywhere."""
 
+import asyncio
 import dataclasses
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.messages.codes import CheckCode, FailedCheck
-from lpac.fleet.on_robot import probes, service
+from lpac.fleet import doctor, probes, up
+from lpac.fleet.settings import load_fleet
+from tests.conftest import ROOT
+from tests.local_session import LocalSession
 
 NAMES = st.from_regex(r"[a-z][a-z0-9-]{0,14}", fullmatch=True)
 ANYTHING = st.text(max_size=200)
@@ -146,7 +149,7 @@ def test_units(wanted: dict[str, tuple[bool, bool, bool]]) -> None:
         f"UnitFileState={'enabled' if enabled else 'disabled'}\n"
         for name, (there, active, enabled) in wanted.items()
     ]
-    assert probes.units("\n".join(blocks)) == {
+    assert probes.units_of("\n".join(blocks)) == {
         name: {"there": there, "active": active, "enabled": enabled}
         for name, (there, active, enabled) in wanted.items()
     }
@@ -175,7 +178,7 @@ def test_containers(
             "Privileged": False,
         },
     }
-    assert probes.containers(json.dumps([inspected])) == [
+    assert probes.containers_of(json.dumps([inspected])) == [
         {
             "name": name,
             "image": image,
@@ -214,11 +217,16 @@ def test_nothing_that_a_tool_prints_is_a_mistake_of_ours(text: str) -> None:
     assert all(level is None or math.isfinite(level) for level in probes.wireless(text).values())
     probes.iw_link(text)
     probes.iw_survey(text)
-    probes.units(text)
+    probes.units_of(text)
     probes.memory(text)
     probes.synchronized(text)
     probes.systemd_version(text)
     probes.without_comments(text)
+    probes.vision_hub(text)
+    probes.disks_of(text)
+    probes.hottest_c(text)
+    probes.wifi_of(text)
+    probes.containers_of(text)
 
 
 def test_systemd_version() -> None:
@@ -227,42 +235,41 @@ def test_systemd_version() -> None:
     assert probes.systemd_version("") is None
 
 
+class Robot(LocalSession):
+    """On the ground, with a program that says one thing after another."""
+
+    def __init__(self, *states: dict[str, Any]) -> None:
+        self.states = list(states)
+        self.ran: list[str] = []
+
+    async def call(self, function: str, **arguments: object) -> dict[str, Any]:
+        if function == "service":
+            return self.states.pop(0)
+        if function == "run":
+            self.ran.append(arguments["command"][2])  # type: ignore[index]
+        return {} if function == "require_disarmed" else {"code": 0, "out": "", "err": ""}
+
+
 def test_a_clock_is_set_by_its_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     # The only clock here is this machine's.
+    robot, config = Robot(), load_fleet(ROOT / "docs" / "fleet.toml")
     set_to: list[float] = []
     monkeypatch.setattr("time.clock_gettime", lambda _: 1000.0)
     monkeypatch.setattr("time.clock_settime", lambda _, seconds: set_to.append(seconds))
-    monkeypatch.setattr("glob.glob", lambda _: [])
-    monkeypatch.setattr(service, "armed", lambda _: False)
-    assert probes.set_clock(offset_s=-20.0, mavlink_port=1)["hardware_clock"] is False
+    asyncio.run(up.set_clock(robot, config.robots["r1"], -20.0))
+    exec(robot.ran[0])
     assert set_to == [1020.0]
 
 
-@pytest.mark.parametrize(("days", "ahead"), [(0.9, False), (1.1, True)])
-def test_starts_that_were_numbered_by_a_clock_far_ahead_are_numbered_anew(
-    days: float, ahead: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    now_ms = 1_800_000_000_000
-    start = tmp_path / "start"
-    start.write_text(f"{now_ms + int(days * 86_400_000)}\n")
-    monkeypatch.setattr(probes, "_START", str(start))
-    monkeypatch.setattr("time.time", lambda: 1e-3 * now_ms)
-    before = start.read_text()
-    assert probes.renumber_starts()["ahead"] is ahead
-    assert start.read_text() == (f"{now_ms}\n" if ahead else before)
-
-
-def test_a_program_is_waited_for_until_it_has_looked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_is_waited_for_until_it_has_looked() -> None:
     told = [CheckCode.CHECKS_RUNNING, CheckCode.FAILSAFE_NOT_READ, CheckCode.GPS_NO_FIX]
 
     def said(code: CheckCode) -> dict[str, Any]:
         check = dataclasses.asdict(FailedCheck(code, "x"))
         return {"fresh": True, "status": {"failed_checks": [check]}}
 
-    states = iter([said(code) for code in told[1:]])
-    monkeypatch.setattr(service, "service", lambda: next(states))
-    monkeypatch.setattr("time.sleep", lambda _: None)
-    assert probes._settled(said(told[0])) == said(CheckCode.GPS_NO_FIX)
+    robot = Robot(*map(said, told[1:]))
+    assert asyncio.run(doctor._settled(robot, said(told[0]))) == said(CheckCode.GPS_NO_FIX)
 
 
 def test_ports_that_others_reach() -> None:
@@ -290,6 +297,7 @@ def test_what_tools_seldom_print() -> None:
     assert probes.wireless("\n\n wlan0: 0000   54.   200.  0\n") == {"wlan0": None}
     assert probes.iw_link("Joined IBSS 02:11:22:33:44:55 (on wlan0)\n")["connected"] is True
     starting = "Id=a.service\nLoadState=loaded\nActiveState=activating\n"
-    assert probes.units(starting) == {"a": {"there": True, "active": True, "enabled": False}}
+    assert probes.units_of(starting) == {"a": {"there": True, "active": True, "enabled": False}}
     told = json.dumps([{"Name": "/box", "HostConfig": {"Privileged": True}}])
-    assert probes.containers(told)[0]["devices"]
+    (box,) = probes.containers_of(told) or []
+    assert box["devices"]

@@ -14,12 +14,14 @@ from tests.conftest import ROOT
 class Robot:
     """A session with a robot whose last start was numbered by a clock far ahead."""
 
-    async def call(self, function: str, **_: object) -> dict[str, Any]:
-        answers: dict[str, dict[str, Any]] = {
-            "renumber_starts": {"ahead": True},
-            "service": {"enabled": True, "active": "active"},
-        }
-        return answers[function]
+    async def look(self, _: object) -> dict[str, str]:
+        return {"start": "1800000000000", "now": "1700000000000"}
+
+    async def must(self, *_: str) -> str:
+        return ""
+
+    async def call(self, _: str) -> dict[str, Any]:
+        return {"enabled": True, "active": "active"}
 
 
 def test_a_start_far_ahead_is_reported_although_the_clock_is_right_by_now(

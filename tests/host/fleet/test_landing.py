@@ -1,23 +1,36 @@
 """A robot's computer listens to its autopilot, and lands a vehicle whose program is gone."""
 
+import asyncio
 import math
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common
 
-from lpac.fleet.on_robot import landing, service
-from lpac.fleet.on_robot.calls import Refused
+from lpac.fleet import agent
+from lpac.fleet.program import land
+from lpac.fleet.session import RemoteError
+from lpac.fleet.settings import load_fleet
 from lpac.sim.ports import free_ports
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.server import Instance, Px4Server
 from lpac.sim.px4.vehicle import Px4Vehicle
+from tests.conftest import ROOT
+from tests.local_session import LocalSession
 from tests.needs import needs
 
 needs_root = needs(root=True)
+ROBOT = load_fleet(ROOT / "docs" / "fleet.toml").robots["r1"]
+
+
+def land_it(port: int, system_id: int) -> dict[str, Any]:
+    robot = replace(ROBOT, mavlink_url=f"udpin://127.0.0.1:{port}", system_id=system_id)
+    return asyncio.run(land(LocalSession(), robot, lambda *_: None))
 
 
 @pytest.fixture
@@ -55,7 +68,7 @@ def test_an_autopilots_heartbeat_tells_whether_it_is_armed(
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        heard = service.hear_heartbeat(port)
+        heard = agent.hear_heartbeat(port)["heartbeat"]
     finally:
         stop.set()
         thread.join()
@@ -70,19 +83,19 @@ def test_an_autopilots_heartbeat_tells_whether_it_is_armed(
 
 @needs_root
 def test_no_heartbeat_is_silence(datagrams: tuple[int, socket.socket]) -> None:
-    assert service.hear_heartbeat(datagrams[0], wait_s=0.2) is None
+    assert agent.hear_heartbeat(datagrams[0], wait_s=0.2) == {"heartbeat": None}
 
 
 @needs_root
 def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPatch) -> None:
     said = {"fresh": True}
-    monkeypatch.setattr(service, "service", lambda: said)
+    monkeypatch.setitem(agent._CALLS, "service", lambda: said)
     vehicle = Px4Vehicle(seed=1, ready_after_s=0.0)
     (port,) = free_ports(1)
 
     def refused(why: str, system_id: int = 7) -> None:
-        with pytest.raises(Refused, match=why):
-            landing.land(port, system_id)
+        with pytest.raises(RemoteError, match=why):
+            land_it(port, system_id)
 
     def takes_off() -> bool:
         if not vehicle.armed and vehicle.armable:
@@ -104,20 +117,21 @@ def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPat
         # PX4 tells it within a second.
         heard: dict[str, object] = {}
         while heard.get("mode") != "position":
-            heard = service.hear_heartbeat(port) or {}
+            heard = agent.hear_heartbeat(port)["heartbeat"] or {}
         refused(r"^a pilot flies it \(position\): he lands it$")
         with server.stepped:
             vehicle.set_mode(Px4Mode.HOLD)
         while heard.get("mode") != "hold":
-            heard = service.hear_heartbeat(port) or {}
-        assert landing.land(port, 7) == {"mode": "land", "armed": True}
+            heard = agent.hear_heartbeat(port)["heartbeat"] or {}
+        landed = land_it(port, 7)
+        assert (landed["mode"], landed["armed"]) == ("land", True)
         assert vehicle.mode is Px4Mode.LAND
         assert server.wait_for(lambda: vehicle.landed and not vehicle.armed, 60.0)
 
 
 @needs_root
 def test_where_nothing_is_heard_nothing_is_landed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "service", lambda: {"fresh": False})
+    monkeypatch.setitem(agent._CALLS, "service", lambda: {"fresh": False})
     (port,) = free_ports(1)
-    with pytest.raises(Refused, match=f"^nothing is heard of PX4 at UDP port {port}$"):
-        landing.land(port, 7)
+    with pytest.raises(RemoteError, match=f"^nothing is heard of PX4 at UDP port {port}$"):
+        land_it(port, 7)
