@@ -8,6 +8,7 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from edge.core.counted import counted
@@ -234,33 +235,69 @@ async def _check_vehicle(
 # Judging: pure
 
 
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """A robot, what was found on it, and the facts of all that answered, its own too."""
+
+    config: FleetConfig
+    robot: RobotHost
+    found: Examination
+    fleet: Mapping[str, Facts]
+
+    @property
+    def facts(self) -> Facts:
+        return self.found.facts
+
+    @property
+    def service(self) -> Facts:
+        its: Facts = self.facts["service"]
+        return its
+
+    @property
+    def enroll(self) -> str:
+        return f"lpac fleet enroll {self.robot.name} {self.robot.host}"
+
+    def command(self, name: str) -> str:
+        return f"lpac fleet {name} --robots {self.robot.name}"
+
+    def on(self, *commands: str) -> str:
+        return on(self.robot, *commands)
+
+
+# What a check comes to: verdict, what was found, and the fix.
+_Finding = tuple[Verdict, str, str]
+
+
+def _ok(found: str) -> _Finding:
+    return "ok", found, ""
+
+
+def _skipped(found: str) -> _Finding:
+    return "skipped", found, ""
+
+
+def _warning(found: str, fix: str) -> _Finding:
+    return "warning", found, fix
+
+
+def _failed(found: str, fix: str) -> _Finding:
+    return "FAILED", found, fix
+
+
+def _graded(found: str, fix: str, *, bad: bool, poor: bool) -> _Finding:
+    return _failed(found, fix) if bad else _warning(found, fix) if poor else _ok(found)
+
+
 def judge(
     config: FleetConfig, robot: RobotHost, fleet: Mapping[str, Examination]
 ) -> Iterator[DoctorCheck]:
     """The checks of a robot; `fleet` has the examinations of all that answered, its own too."""
-    found = fleet[robot.name]
-    facts = found.facts
-    yield _identity(config, robot, facts)
-    yield _card(config, robot, facts["card"])
     of_all = {name: other.facts for name, other in fleet.items()}
-    if config.radio.transport == "multicast" and config.keys is not None:
-        yield _group(robot, of_all)
-    yield _release(config, robot, of_all)
-    yield _program(config, robot, fleet)
-    yield _system(facts)
-    yield _disk(facts)
-    yield _clock(facts, found.clock)
-    yield _processor(facts)
-    yield _memory(facts)
-    yield _wifi(robot, facts["wifi"])
-    yield _radio(found.pings, set(fleet))
-    yield _mavlink(robot, facts)
-    yield _px4(robot, facts)
-    yield _vision_hub(config, robot, facts["vision_hub"])
-    yield _doors(config, robot, facts)
-    yield _commanders(config, robot, facts)
-    yield _containers(config, robot, facts["containers"])
-    yield from _vehicle(robot, facts, found.vehicle)
+    judged = _Judged(config, robot, fleet[robot.name], of_all)
+    for name, check in _CHECKS.items():
+        finding = check(judged)
+        if finding is not None:
+            yield DoctorCheck(name, *finding)
 
 
 def on(robot: RobotHost, *commands: str) -> str:
@@ -280,53 +317,42 @@ def _reach_fix(config: FleetConfig, robot: RobotHost) -> str:
     return f"switch {robot.name} on, look at its Wi-Fi, then try: {shlex.join(ssh)}"
 
 
-def _enroll(robot: RobotHost) -> str:
-    return f"lpac fleet enroll {robot.name} {robot.host}"
-
-
-def _deploy(robot: RobotHost) -> str:
-    return f"lpac fleet deploy --robots {robot.name}"
-
-
-def _identity(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorCheck:
-    if facts["identity"] is None:
-        return DoctorCheck("enrolled", "FAILED", "it was never enrolled", _enroll(robot))
-    wrong = wrong_identity(facts["identity"], config, robot)
+def _identity(its: _Judged) -> _Finding:
+    if its.facts["identity"] is None:
+        return _failed("it was never enrolled", its.enroll)
+    wrong = wrong_identity(its.facts["identity"], its.config, its.robot)
     if wrong is not None:
-        return DoctorCheck("enrolled", "FAILED", *wrong)
-    return DoctorCheck("enrolled", "ok", f"robot id {robot.robot_id} of fleet {config.fleet}")
+        return _failed(*wrong)
+    return _ok(f"robot id {its.robot.robot_id} of fleet {its.config.fleet}")
 
 
-def _card(config: FleetConfig, robot: RobotHost, card: str | None) -> DoctorCheck:
-    name = "card"
-    if config.keys is None:
+def _card(its: _Judged) -> _Finding:
+    if its.config.keys is None:
         found = "insecure: whoever is on the network can fly it"
-        return DoctorCheck(name, "warning", found, f"take insecure out of {config.path.name}")
-    if card is None:
-        return DoctorCheck(name, "FAILED", "it has no card of the fleet", _enroll(robot))
+        return _warning(found, f"take insecure out of {its.config.path.name}")
+    if its.facts["card"] is None:
+        return _failed("it has no card of the fleet", its.enroll)
     try:
-        own = card_in(card, config.keys)
+        own = card_in(its.facts["card"], its.config.keys)
     except (OSError, ConfigError) as error:
-        return DoctorCheck(name, "FAILED", str(error), _enroll(robot))
-    if own.robot_id != robot.robot_id:
-        return DoctorCheck(name, "FAILED", f"its card is {own.name}'s", _enroll(robot))
+        return _failed(str(error), its.enroll)
+    if own.robot_id != its.robot.robot_id:
+        return _failed(f"its card is {own.name}'s", its.enroll)
     until = time.strftime("%Y-%m-%d", time.gmtime(own.expires_unix_s))
-    return DoctorCheck(name, "ok", f"a member of fleet {own.fleet} until {until}")
+    return _ok(f"a member of fleet {own.fleet} until {until}")
 
 
-def _group(robot: RobotHost, fleet: Mapping[str, Facts]) -> DoctorCheck:
+def _group(its: _Judged) -> _Finding | None:
     """Whether it has the key that the others have: by it robots hear each other in multicast."""
-    name = "group key"
-    has = {other: its["group_keys"] for other, its in fleet.items() if its["group_keys"]}
-    if robot.name not in has:
-        return DoctorCheck(name, "FAILED", "it has none: its program does not start", _UP)
-    others = _others_than_most(has, robot.name)
-    if others:
+    if its.config.radio.transport != "multicast" or its.config.keys is None:
+        return None
+    has = {other: of["group_keys"] for other, of in its.fleet.items() if of["group_keys"]}
+    if its.robot.name not in has:
+        return _failed("it has none: its program does not start", _UP)
+    if others := _others_than_most(has, its.robot.name):
         found = f"it has another one than {', '.join(others)}: not all of them hear each other"
-        return DoctorCheck(name, "FAILED", found, _UP)
-    return DoctorCheck(
-        name, "ok", f"it has one, and so have {len(has)} of {counted(len(fleet), 'robot')}"
-    )
+        return _failed(found, _UP)
+    return _ok(f"it has one, and so have {len(has)} of {counted(len(its.fleet), 'robot')}")
 
 
 def _others_than_most(has: Mapping[str, Any], robot: str) -> list[str]:
@@ -340,73 +366,21 @@ def _others_than_most(has: Mapping[str, Any], robot: str) -> list[str]:
     return [other for other, its in has.items() if its != has[robot]]
 
 
-def _doors(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorCheck:
-    """Ways to the vehicle past the fleet's keys."""
-    name = "doors"
-    users = facts["factory_passwords"]
-    if users:
-        found = f"{', '.join(users)}: no password, or the one that every VOXL comes with"
-        return DoctorCheck(name, "FAILED", found, on(robot, *(f"passwd {user}" for user in users)))
-    # Members knock at the UDP port of the radio's number.
-    radio = {(protocol, robot.zenoh_port) for protocol in ("tcp", "udp")}
-    expected = {("tcp", robot.port or 22), *radio}
-    if config.radio.transport == "multicast":
-        expected.add(("udp", int(config.radio.group.rpartition(":")[2])))
-    others = [
-        each for each in facts["open_ports"] if (each["protocol"], each["port"]) not in expected
-    ]
-    mavlink = [each for each in others if _may_be_mavlink(each)]
-    if mavlink:
-        found = f"others on the network may reach PX4's MAVLink: {_ports(mavlink)}"
-        rules = [
-            f"iptables -I INPUT ! -i lo -p udp --dport {each['port']} -j DROP" for each in mavlink
-        ]
-        return DoctorCheck(name, "warning", found, on(robot, *rules) + " (at every boot)")
-    if others:
-        found = f"other programs listen to the network: {_ports(others)}"
-        return DoctorCheck(name, "warning", found, "stop what the fleet does not need")
-    found = "ssh and the radio alone listen to the network"
-    if config.keys is None:
-        return DoctorCheck(name, "ok", found)
-    if not facts["drops_strangers"]:
-        found += "; whoever floods the radio's port closes it: the kernel lets root alone filter"
-        allow = "keep strangers out of the Wi-Fi, or let the program filter: docs/security.md"
-        return DoctorCheck(name, "warning", found, allow)
-    return DoctorCheck(name, "ok", f"{found}; the kernel drops strangers who flood it")
-
-
-def _may_be_mavlink(port: Facts) -> bool:
-    """By its number, as PX4 and ground stations have them, or by who has it."""
-    its = port["program"].startswith(("px4", "voxl-mavlink", "voxl-vision", "mavlink"))
-    return bool(port["protocol"] == "udp" and (its or 14_540 <= port["port"] <= 14_599))
-
-
-def _ports(ports: Sequence[Facts]) -> str:
-    return ", ".join(f"{each['protocol']} {each['port']} ({each['program']})" for each in ports)
-
-
-def _release(config: FleetConfig, robot: RobotHost, fleet: Mapping[str, Facts]) -> DoctorCheck:
-    facts = fleet[robot.name]
-    name = "release"
-    if facts["pending"] is not None:
-        return DoctorCheck(name, "FAILED", "a switch of releases was interrupted", _UP)
-    versions = facts["versions"]
-    if facts["current"] is None or versions is None:
-        return DoctorCheck(name, "FAILED", "there is none", _deploy(robot))
+def _release(its: _Judged) -> _Finding:
+    if its.facts["pending"] is not None:
+        return _failed("a switch of releases was interrupted", _UP)
+    if its.facts["current"] is None or its.facts["versions"] is None:
+        return _failed("there is none", its.command("deploy"))
+    versions = {other: of["versions"] for other, of in its.fleet.items() if of["versions"]}
     for part in ("image", "bundle", "world"):
-        has = {
-            other: str(its["versions"].get(part))
-            for other, its in fleet.items()
-            if its["versions"] is not None
-        }
-        others = _others_than_most(has, robot.name)
-        if others:
-            found = f"its {part} is {has[robot.name][:12]}, another one than that of "
-            return DoctorCheck(name, "FAILED", found + ", ".join(others), "lpac fleet deploy")
-    if not is_configured(config, robot, facts):
-        found = f"its configuration is not the one of {config.path.name}"
-        return DoctorCheck(name, "FAILED", found, _deploy(robot))
-    return DoctorCheck(name, "ok", f"{facts['current']}")
+        has = {other: str(of.get(part)) for other, of in versions.items()}
+        if others := _others_than_most(has, its.robot.name):
+            found = f"its {part} is {has[its.robot.name][:12]}, another one than that of "
+            return _failed(found + ", ".join(others), "lpac fleet deploy")
+    if not is_configured(its.config, its.robot, its.facts):
+        found = f"its configuration is not the one of {its.config.path.name}"
+        return _failed(found, its.command("deploy"))
+    return _ok(its.facts["current"])
 
 
 def is_configured(config: FleetConfig, robot: RobotHost, overview: Facts) -> bool:
@@ -420,222 +394,178 @@ def is_configured(config: FleetConfig, robot: RobotHost, overview: Facts) -> boo
     return bool(overview["robot_toml"] == hashlib.sha256(text.encode()).hexdigest())
 
 
-def _program(
-    config: FleetConfig, robot: RobotHost, fleet: Mapping[str, Examination]
-) -> DoctorCheck:
-    facts = fleet[robot.name].facts
-    service = facts["service"]
-    name = "program"
-    if facts["current"] is None:
-        return DoctorCheck(name, "skipped", "it has no release")
-    if config.slot_of(robot.name) is None:
+def _program(its: _Judged) -> _Finding:
+    service = its.service
+    if its.facts["current"] is None:
+        return _skipped("it has no release")
+    if its.config.slot_of(its.robot.name) is None:
         if service["active"] == "active":
-            return DoctorCheck(
-                name, "FAILED", "it is a spare, and its program runs", _deploy(robot)
-            )
-        return DoctorCheck(name, "ok", "spare: not started")
-    start = f"lpac fleet start --robots {robot.name}"
-    logs = f"lpac fleet logs --robots {robot.name}"
+            return _failed("it is a spare, and its program runs", its.command("deploy"))
+        return _ok("spare: not started")
+    start, logs = its.command("start"), its.command("logs")
     if service["active"] != "active":
-        return DoctorCheck(
-            name, "FAILED", f"it is {service['active']} ({service['result']})", start
-        )
+        return _failed(f"it is {service['active']} ({service['result']})", start)
     if not service["fresh"]:
-        return DoctorCheck(name, "FAILED", "it runs, and says nothing", logs)
+        return _failed("it runs, and says nothing", logs)
     if not service["enabled"]:
-        return DoctorCheck(name, "warning", "it does not start after a battery swap", start)
+        return _warning("it does not start after a battery swap", start)
     if service["restarts"]:
-        return DoctorCheck(name, "warning", f"it was restarted {service['restarts']} times", logs)
-    running = [other for other, its in fleet.items() if its.facts["service"]["fresh"]]
-    if config.radio.transport == "multicast":  # Grounds alone connect, and there may be none now.
-        return DoctorCheck(name, "ok", f"runs: {service['status']['state']}")
-    peers, wanted = service["status"]["peers"], len(running) - 1
+        return _warning(f"it was restarted {service['restarts']} times", logs)
+    state, peers = service["status"]["state"], service["status"]["peers"]
+    if its.config.radio.transport == "multicast":  # Grounds alone connect: there may be none now.
+        return _ok(f"runs: {state}")
+    wanted = sum(bool(of["service"]["fresh"]) for of in its.fleet.values()) - 1
     if peers < wanted:
         found = f"it is connected to {peers} of the {wanted} other programs"
-        return DoctorCheck(name, "warning", found, "lpac fleet radio")
-    return DoctorCheck(name, "ok", f"runs: {service['status']['state']}, {peers} peers")
+        return _warning(found, "lpac fleet radio")
+    return _ok(f"runs: {state}, {peers} peers")
 
 
-def _system(facts: Facts) -> DoctorCheck:
-    name = "system"
-    systemd = facts["systemd"]
+def _system(its: _Judged) -> _Finding:
+    facts, systemd = its.facts, its.facts["systemd"]
     found = f"Linux {facts['kernel']}, systemd {systemd}, Python {facts['python']}"
     found += f", SDK {facts['sdk']}" if facts["sdk"] else ""
     if _numbers(facts["python"]) < _LEAST_PYTHON or systemd is None or systemd < _LEAST_SYSTEMD:
         fix = "the robot needs Python 3.6 and systemd 237 or newer: update its system"
-        return DoctorCheck(name, "FAILED", found, fix)
+        return _failed(found, fix)
     if not facts["rsync"]:
-        return DoctorCheck(name, "FAILED", "rsync is missing", "install rsync on the robot")
+        return _failed("rsync is missing", "install rsync on the robot")
     if _numbers(facts["kernel"]) < _LEAST_KERNEL:
-        return DoctorCheck(
-            name, "warning", f"{found}: older than what is known to work", "update it"
-        )
-    return DoctorCheck(name, "ok", found)
+        return _warning(f"{found}: older than what is known to work", "update it")
+    return _ok(found)
 
 
-def _disk(facts: Facts) -> DoctorCheck:
-    least = min(facts["disks"], key=lambda disk: float(disk["free_bytes"]))
+def _disk(its: _Judged) -> _Finding:
+    least = min(its.facts["disks"], key=lambda disk: float(disk["free_bytes"]))
     free_mb, total_mb = least["free_bytes"] / _MB, least["total_bytes"] / _MB
-    found = f"{free_mb:.0f} of {total_mb:.0f} MB free at {least['path']}"
     fix = (
         "lpac fleet pull, then remove old logs on the robot (/var/lib/lpac/logs, /data/px4/log), "
         "but not the newest, from which their numbers go on"
     )
-    if free_mb < _LEAST_DISK_MB:
-        return DoctorCheck("disk", "FAILED", found, fix)
-    if free_mb < _GOOD_DISK_MB:
-        return DoctorCheck("disk", "warning", found, fix)
-    return DoctorCheck("disk", "ok", found)
+    return _graded(
+        f"{free_mb:.0f} of {total_mb:.0f} MB free at {least['path']}", fix,
+        bad=free_mb < _LEAST_DISK_MB, poor=free_mb < _GOOD_DISK_MB,
+    )  # fmt: skip
 
 
-def _clock(facts: Facts, clock: ClockOffset) -> DoctorCheck:
-    offset_s, uncertainty_s = clock
+def _clock(its: _Judged) -> _Finding:
+    offset_s, uncertainty_s = its.found.clock
     way = "ahead of" if offset_s > 0.0 else "behind"
     found = f"{_duration(abs(offset_s))} {way} the laptop's (± {1000.0 * uncertainty_s:.0f} ms)"
-    found += ", kept by a time server" if facts["synchronized"] else ""
-    if abs(offset_s) > MOST_CLOCK_OFFSET_S + uncertainty_s:
-        return DoctorCheck("clock", "FAILED", found, _UP)
-    if abs(offset_s) > GOOD_CLOCK_OFFSET_S + uncertainty_s:
-        return DoctorCheck("clock", "warning", found, _UP)
-    return DoctorCheck("clock", "ok", found)
+    found += ", kept by a time server" if its.facts["synchronized"] else ""
+    surely_s = abs(offset_s) - uncertainty_s
+    return _graded(
+        found, _UP, bad=surely_s > MOST_CLOCK_OFFSET_S, poor=surely_s > GOOD_CLOCK_OFFSET_S
+    )
 
 
-def _processor(facts: Facts) -> DoctorCheck:
-    cores = f"{facts['cpus']} cores, load {facts['load']:.1f}"
-    hottest_c = facts["hottest_c"]
-    fix = "let it cool, with wind on it; switch it on later"
+def _processor(its: _Judged) -> _Finding:
+    cores = f"{its.facts['cpus']} cores, load {its.facts['load']:.1f}"
+    hottest_c = its.facts["hottest_c"]
     if hottest_c is None:
-        return DoctorCheck("processor", "ok", f"{cores}, temperature not known")
-    found = f"{cores}, {hottest_c:.0f} °C"
-    if hottest_c >= _HOT_C:
-        return DoctorCheck("processor", "FAILED", f"{found}: it slows down near 90 °C", fix)
-    if hottest_c >= _WARM_C:
-        return DoctorCheck("processor", "warning", f"{found}: it slows down near 90 °C", fix)
-    return DoctorCheck("processor", "ok", found)
+        return _ok(f"{cores}, temperature not known")
+    slows = ": it slows down near 90 °C" if hottest_c >= _WARM_C else ""
+    fix = "let it cool, with wind on it; switch it on later"
+    found = f"{cores}, {hottest_c:.0f} °C{slows}"
+    return _graded(found, fix, bad=hottest_c >= _HOT_C, poor=hottest_c >= _WARM_C)
 
 
-def _memory(facts: Facts) -> DoctorCheck:
-    memory = facts["memory"]
+def _memory(its: _Judged) -> _Finding:
+    memory = its.facts["memory"]
     if memory is None:
-        return DoctorCheck("memory", "skipped", "not known")
+        return _skipped("not known")
     free_mb, total_mb = memory["available_bytes"] / _MB, memory["total_bytes"] / _MB
-    found = f"{free_mb:.0f} of {total_mb:.0f} MB available"
     fix = "stop what takes it (`top` on the robot), or switch the robot off and on"
-    if free_mb < _LEAST_MEMORY_MB:
-        return DoctorCheck("memory", "FAILED", found, fix)
-    return DoctorCheck("memory", "warning" if free_mb < _GOOD_MEMORY_MB else "ok", found, fix)
+    found = f"{free_mb:.0f} of {total_mb:.0f} MB available"
+    return _graded(found, fix, bad=free_mb < _LEAST_MEMORY_MB, poor=free_mb < _GOOD_MEMORY_MB)
 
 
-def _wifi(robot: RobotHost, links: Sequence[Facts]) -> DoctorCheck:
-    name = "wifi"
+def _wifi(its: _Judged) -> _Finding:
+    links = its.facts["wifi"]
     if not links:
-        return DoctorCheck(
-            name, "skipped", "no wireless interface: wired, or its driver does not say"
-        )
+        return _skipped("no wireless interface: wired, or its driver does not say")
     link = max(links, key=lambda each: (each["connected"] is True, each["signal_dbm"] is not None))
-    words = [str(link["network"] or link["name"])]
-    words += [f"{link['signal_dbm']:.0f} dBm"] if link["signal_dbm"] is not None else []
-    words += [f"{link['rate_mbit_s']:g} Mbit/s"] if link["rate_mbit_s"] is not None else []
+    name, signal_dbm, rate_mbit_s = link["name"], link["signal_dbm"], link["rate_mbit_s"]
+    words = [str(link["network"] or name)]
+    words += [f"{signal_dbm:.0f} dBm"] if signal_dbm is not None else []
+    words += [f"{rate_mbit_s:g} Mbit/s"] if rate_mbit_s is not None else []
     words += ["power save on"] if link["power_save"] else []
     found = ", ".join(words)
     if link["connected"] is False:
-        return DoctorCheck(
-            name, "warning", f"{link['name']} is not connected", "join the fleet's Wi-Fi"
-        )
+        return _warning(f"{name} is not connected", "join the fleet's Wi-Fi")
     if link["power_save"]:
-        fix = on(robot, f"iw dev {link['name']} set power_save off")
-        return DoctorCheck(name, "warning", f"{found}: messages are late", f"{fix} (at every boot)")
-    if link["signal_dbm"] is not None and link["signal_dbm"] < _WEAK_DBM:
-        return DoctorCheck(
-            name, "warning", f"{found}: weak", "bring the access point nearer, or higher"
-        )
-    return DoctorCheck(name, "ok", found)
+        fix = its.on(f"iw dev {name} set power_save off")
+        return _warning(f"{found}: messages are late", f"{fix} (at every boot)")
+    if signal_dbm is not None and signal_dbm < _WEAK_DBM:
+        return _warning(f"{found}: weak", "bring the access point nearer, or higher")
+    return _ok(found)
 
 
-def _radio(pings: Mapping[str, Facts] | str, answering: set[str]) -> DoctorCheck:
-    name = "radio"
+def _radio(its: _Judged) -> _Finding:
+    pings = its.found.pings
     if isinstance(pings, str):
-        return DoctorCheck(name, "skipped", pings)
+        return _skipped(pings)
     # A robot that is off is its own fault, not that of all others.
-    heard = {other: ping for other, ping in pings.items() if other in answering}
+    heard = {other: ping for other, ping in pings.items() if other in its.fleet}
     if not heard:
-        return DoctorCheck(name, "skipped", "no other robot answers")
+        return _skipped("no other robot answers")
     fix = (
         "lpac fleet radio; all must be in one network, and the access point must let its clients "
         "reach each other"
     )
-    deaf = [other for other, ping in heard.items() if ping["loss"] >= 1.0]
-    if deaf:
-        return DoctorCheck(name, "FAILED", f"no answer from {', '.join(deaf)}", fix)
+    if deaf := [other for other, ping in heard.items() if ping["loss"] >= 1.0]:
+        return _failed(f"no answer from {', '.join(deaf)}", fix)
     bad = [
         f"{other}: {100.0 * ping['loss']:.0f} % lost, {ping['mean_ms']:.0f} ms"
         for other, ping in heard.items()
         if ping["loss"] > _LOST_TOO_MUCH or ping["mean_ms"] > _SLOW_MS
     ]
     if bad:
-        return DoctorCheck(name, "warning", "; ".join(bad), fix)
+        return _warning("; ".join(bad), fix)
     slowest_ms = max(ping["mean_ms"] for ping in heard.values())
-    return DoctorCheck(
-        name,
-        "ok",
-        f"{counted(len(heard), 'robot')}: slowest answer within {slowest_ms:.1f} ms",
-    )
+    return _ok(f"{counted(len(heard), 'robot')}: slowest answer within {slowest_ms:.1f} ms")
 
 
-def _mavlink(robot: RobotHost, facts: Facts) -> DoctorCheck:
-    name = "mavlink"
-    status, heartbeat = facts["service"]["status"], facts["heartbeat"]
-    runs = facts["service"]["fresh"]
+def _mavlink(its: _Judged) -> _Finding:
+    robot, status, beat = its.robot, its.service["status"], its.facts["heartbeat"]
+    runs, port = its.service["fresh"], robot.mavlink_port
+    fix = its.on("systemctl status voxl-px4 voxl-mavlink-server voxl-vision-hub")
     if runs and not status["autopilot"]:
-        about = [c.text for c in _checks(status["failed_checks"]) if c.code in _NO_AUTOPILOT]
-        return DoctorCheck(
-            name, "FAILED", about[0] if about else "the autopilot is silent", _px4_fix(robot)
-        )
-    if facts["service"]["active"] == "active" and not runs:
-        return DoctorCheck(name, "skipped", "the robot's program has the port, and says nothing")
-    if not runs and heartbeat is None:
-        found = f"no heartbeat of PX4 at UDP port {robot.mavlink_port}"
-        return DoctorCheck(name, "FAILED", found, _px4_fix(robot))
-    system_id = status["system_id"] if runs else heartbeat["system_id"]
+        about = [c.text for c in _told(status["failed_checks"]) if c.code in _NO_AUTOPILOT]
+        return _failed(about[0] if about else "the autopilot is silent", fix)
+    if its.service["active"] == "active" and not runs:
+        return _skipped("the robot's program has the port, and says nothing")
+    if not runs and beat is None:
+        return _failed(f"no heartbeat of PX4 at UDP port {port}", fix)
+    system_id = status["system_id"] if runs else beat["system_id"]
     if system_id != robot.system_id:
         found = f"PX4 has system id {system_id}, configured is {robot.system_id}"
-        return DoctorCheck(name, "FAILED", found, f"{_enroll(robot)} (it sets MAV_SYS_ID)")
-    return DoctorCheck(
-        name, "ok", f"PX4 answers at port {robot.mavlink_port}, system id {system_id}"
-    )
+        return _failed(found, f"{its.enroll} (it sets MAV_SYS_ID)")
+    return _ok(f"PX4 answers at port {port}, system id {system_id}")
 
 
-def _px4_fix(robot: RobotHost) -> str:
-    return on(robot, "systemctl status voxl-px4 voxl-mavlink-server voxl-vision-hub")
+def _px4(its: _Judged) -> _Finding:
+    parts = {part: of for part, of in its.facts["units"].items() if part in _PX4_PARTS}
+    version = its.facts["px4"]
+    if not any(of["there"] for of in parts.values()) and version is None:
+        return _skipped("not a VOXL2: there is no voxl-px4")
+    if idle := [part for part, of in parts.items() if not of["active"]]:
+        fix = its.on(f"systemctl enable --now {' '.join(idle)}")
+        return _failed(f"{', '.join(idle)} does not run", fix)
+    if version is None:
+        return _skipped("its services run; its version is not known to dpkg")
+    if _numbers(version) < _LEAST_PX4:
+        return _failed(f"PX4 {version} is older than 1.14", "update the VOXL SDK")
+    return _ok(f"PX4 {version}")
 
 
-def _px4(robot: RobotHost, facts: Facts) -> DoctorCheck:
-    name = "px4"
-    parts = {part: its for part, its in facts["units"].items() if part in _PX4_PARTS}
-    if not any(its["there"] for its in parts.values()) and facts["px4"] is None:
-        return DoctorCheck(name, "skipped", "not a VOXL2: there is no voxl-px4")
-    idle = [part for part, its in parts.items() if not its["active"]]
-    if idle:
-        return DoctorCheck(
-            name, "FAILED", f"{', '.join(idle)} does not run",
-            on(robot, f"systemctl enable --now {' '.join(idle)}"),
-        )  # fmt: skip
-    if facts["px4"] is None:
-        return DoctorCheck(name, "skipped", "its services run; its version is not known to dpkg")
-    if _numbers(facts["px4"]) < _LEAST_PX4:
-        return DoctorCheck(
-            name, "FAILED", f"PX4 {facts['px4']} is older than 1.14", "update the VOXL SDK"
-        )
-    return DoctorCheck(name, "ok", f"PX4 {facts['px4']}")
-
-
-def _vision_hub(config: FleetConfig, robot: RobotHost, found: Facts | None) -> DoctorCheck:
-    name = "vision-hub"
+def _vision_hub(its: _Judged) -> _Finding:
+    found = its.facts["vision_hub"]
     if found is None:
-        return DoctorCheck(name, "skipped", "there is no voxl-vision-hub")
-    fix = f"{_enroll(robot)} (it writes /etc/modalai/voxl-vision-hub.conf)"
+        return _skipped("there is no voxl-vision-hub")
+    fix = f"{its.enroll} (it writes /etc/modalai/voxl-vision-hub.conf)"
     if "problem" in found:
-        return DoctorCheck(name, "FAILED", str(found["problem"]), fix)
+        return _failed(str(found["problem"]), fix)
     faults = []
     mode, port = found["offboard_mode"], found["localhost_udp_port_number"]
     if mode != "off":
@@ -643,57 +573,84 @@ def _vision_hub(config: FleetConfig, robot: RobotHost, found: Facts | None) -> D
         faults.append(f"offboard_mode is {stands}: it flies by itself in offboard mode")
     if found["en_localhost_mavlink_udp"] is not True:
         faults.append("en_localhost_mavlink_udp is not true: PX4 cannot be reached")
-    if port not in (None, robot.mavlink_port):
-        faults.append(f"PX4 comes to UDP port {port}, configured is {robot.mavlink_port}")
+    if port not in (None, its.robot.mavlink_port):
+        faults.append(f"PX4 comes to UDP port {port}, configured is {its.robot.mavlink_port}")
     if faults:
-        return DoctorCheck(name, "FAILED", "; ".join(faults), fix)
-    return DoctorCheck(name, "ok", "offboard_mode is off, MAVLink comes to this host")
+        return _failed("; ".join(faults), fix)
+    return _ok("offboard_mode is off, MAVLink comes to this host")
 
 
-def _commanders(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorCheck:
+def _doors(its: _Judged) -> _Finding:
+    """Ways to the vehicle past the fleet's keys."""
+    robot, radio = its.robot, its.config.radio
+    if users := its.facts["factory_passwords"]:
+        found = f"{', '.join(users)}: no password, or the one that every VOXL comes with"
+        return _failed(found, its.on(*(f"passwd {user}" for user in users)))
+    # Members knock at the UDP port of the radio's number.
+    expected = {("tcp", robot.port or 22), ("tcp", robot.zenoh_port), ("udp", robot.zenoh_port)}
+    if radio.transport == "multicast":
+        expected.add(("udp", int(radio.group.rpartition(":")[2])))
+    ports = its.facts["open_ports"]
+    others = [each for each in ports if (each["protocol"], each["port"]) not in expected]
+    if mavlink := [each for each in others if _may_be_mavlink(each)]:
+        found = f"others on the network may reach PX4's MAVLink: {_ports(mavlink)}"
+        drop = "iptables -I INPUT ! -i lo -p udp --dport {} -j DROP"
+        fix = its.on(*(drop.format(each["port"]) for each in mavlink))
+        return _warning(found, f"{fix} (at every boot)")
+    if others:
+        found = f"other programs listen to the network: {_ports(others)}"
+        return _warning(found, "stop what the fleet does not need")
+    found = "ssh and the radio alone listen to the network"
+    if its.config.keys is None:
+        return _ok(found)
+    if not its.facts["drops_strangers"]:
+        found += "; whoever floods the radio's port closes it: the kernel lets root alone filter"
+        allow = "keep strangers out of the Wi-Fi, or let the program filter: docs/security.md"
+        return _warning(found, allow)
+    return _ok(f"{found}; the kernel drops strangers who flood it")
+
+
+def _may_be_mavlink(port: Facts) -> bool:
+    """By its number, as PX4 and ground stations have them, or by who has it."""
+    its = port["program"].startswith(("px4", "voxl-mavlink", "voxl-vision", "mavlink"))
+    return bool(port["protocol"] == "udp" and (its or 14_540 <= port["port"] <= 14_599))
+
+
+def _ports(ports: Sequence[Facts]) -> str:
+    return ", ".join(f"{each['protocol']} {each['port']} ({each['program']})" for each in ports)
+
+
+def _commanders(its: _Judged) -> _Finding:
     """Units of others that may send setpoints."""
-    units = facts["units"]
-    suspects = [*_COMMANDERS, *(name.removesuffix(".service") for name in config.predecessors)]
-    runs = [name for name in suspects if units.get(name, {}).get("active")]
-    if runs:
-        return DoctorCheck(
-            "commanders", "FAILED", f"{', '.join(runs)} runs: it may command PX4 too",
-            on(robot, f"systemctl disable --now {' '.join(runs)}"),
-        )  # fmt: skip
-    waits = [name for name in suspects if units.get(name, {}).get("enabled")]
-    if waits:
-        return DoctorCheck(
-            "commanders", "FAILED", f"{', '.join(waits)} starts at the next boot",
-            on(robot, f"systemctl disable {' '.join(waits)}"),
-        )  # fmt: skip
-    return DoctorCheck("commanders", "ok", "no other program that is known to command PX4 runs")
+    units = its.facts["units"]
+    suspects = [*_COMMANDERS, *(name.removesuffix(".service") for name in its.config.predecessors)]
+    for state, option, found in (
+        ("active", " --now", "runs: it may command PX4 too"),
+        ("enabled", "", "starts at the next boot"),
+    ):
+        if bad := [name for name in suspects if units.get(name, {}).get(state)]:
+            fix = its.on(f"systemctl disable{option} {' '.join(bad)}")
+            return _failed(f"{', '.join(bad)} {found}", fix)
+    return _ok("no other program that is known to command PX4 runs")
 
 
-def _containers(
-    config: FleetConfig, robot: RobotHost, containers: Sequence[Facts] | None
-) -> DoctorCheck:
-    name = "containers"
+def _containers(its: _Judged) -> _Finding:
+    containers = its.facts["containers"]
     if containers is None:
-        fix = on(robot, "docker ps --all")
-        return DoctorCheck(name, "warning", "there is docker, and it does not answer", fix)
-    bad = []
+        return _warning("there is docker, and it does not answer", its.on("docker ps --all"))
+    bad = {}
     for container in containers:
-        why = _why_suspect(container, config.predecessors)
+        why = _why_suspect(container, its.config.predecessors)
         returns = container["restarts"] in ("always", "unless-stopped")
         if why and (container["running"] or returns):
             state = "runs" if container["running"] else "comes back by itself"
-            bad.append((container["name"], f"{container['name']} ({why}) {state}"))
+            bad[container["name"]] = f"{container['name']} ({why}) {state}"
     if bad:
-        names = " ".join(each for each, _ in bad)
-        found = "; ".join(text for _, text in bad) + ": it could command the vehicle"
-        return DoctorCheck(
-            name,
-            "FAILED",
-            found,
-            on(robot, f"docker update --restart=no {names}", f"docker stop {names}"),
-        )
+        names = " ".join(bad)
+        fix = its.on(f"docker update --restart=no {names}", f"docker stop {names}")
+        return _failed("; ".join(bad.values()) + ": it could command the vehicle", fix)
     running = sum(bool(container["running"]) for container in containers)
-    return DoctorCheck(name, "ok", f"{running} run, none that could command the vehicle")
+    return _ok(f"{running} run, none that could command the vehicle")
 
 
 def _why_suspect(container: Facts, predecessors: Sequence[str]) -> str:
@@ -706,23 +663,16 @@ def _why_suspect(container: Facts, predecessors: Sequence[str]) -> str:
     return "access to devices" if container["devices"] else ""
 
 
-def _vehicle(robot: RobotHost, facts: Facts, vehicle: Facts | str) -> Iterator[DoctorCheck]:
-    """PX4's failsafe parameters, and what else keeps the vehicle from taking off."""
-    service = facts["service"]
-    if service["fresh"]:
-        checks = _checks(service["status"]["failed_checks"])
-        cut = service["status"]["failed_checks_more"] > 0
-    elif isinstance(vehicle, str):
-        yield DoctorCheck("failsafe", "skipped", vehicle)
-        yield DoctorCheck("preflight", "skipped", vehicle)
-        return
-    else:
-        checks, cut = _checks(vehicle["failed"]), False
-    yield _failsafe(robot, checks, cut)
-    yield _preflight([c for c in checks if c.code not in (*_GROUND, *_SAID_ELSEWHERE)], cut)
+def _failed_checks(its: _Judged) -> tuple[list[FailedCheck], bool] | str:
+    """What keeps the vehicle from taking off, and whether that is all; or why it is not known."""
+    if its.service["fresh"]:
+        status = its.service["status"]
+        return _told(status["failed_checks"]), status["failed_checks_more"] == 0
+    vehicle = its.found.vehicle
+    return vehicle if isinstance(vehicle, str) else (_told(vehicle["failed"]), True)
 
 
-def _checks(told: Sequence[Facts]) -> list[FailedCheck]:
+def _told(told: Sequence[Facts]) -> list[FailedCheck]:
     """As the robot's program tells them; what this one has no name for is some other check."""
     return [
         FailedCheck(CheckCode(each["code"]), each["text"], bool(each["settles_by_itself"]))
@@ -730,25 +680,31 @@ def _checks(told: Sequence[Facts]) -> list[FailedCheck]:
     ]
 
 
-def _failsafe(robot: RobotHost, checks: Sequence[FailedCheck], cut: bool) -> DoctorCheck:
-    name = "failsafe"
+def _failsafe(its: _Judged) -> _Finding:
+    """PX4's failsafe parameters."""
+    known = _failed_checks(its)
+    if isinstance(known, str):
+        return _skipped(known)
+    checks, is_all = known
     not_read = (*_NO_AUTOPILOT, CheckCode.CHECKS_RUNNING, CheckCode.FAILSAFE_NOT_READ)
     if any(check.code in not_read for check in checks):
-        return DoctorCheck(name, "warning", "PX4's parameters were not read", "try again")
-    wrong = [check for check in checks if check.code is CheckCode.FAILSAFE_WRONG]
-    if wrong:
-        fix = f"{_enroll(robot)} (it sets them, and restarts PX4 if need be)"
-        return DoctorCheck(name, "FAILED", texts(wrong), fix)
-    if cut:
+        return _warning("PX4's parameters were not read", "try again")
+    if wrong := [check for check in checks if check.code is CheckCode.FAILSAFE_WRONG]:
+        return _failed(texts(wrong), f"{its.enroll} (it sets them, and restarts PX4 if need be)")
+    if not is_all:
         found = "not among the first failed checks: there may be more"
-        return DoctorCheck(name, "warning", found, "mend what `preflight` names, then try again")
-    return DoctorCheck(name, "ok", "PX4's parameters are as they must be")
+        return _warning(found, "mend what `preflight` names, then try again")
+    return _ok("PX4's parameters are as they must be")
 
 
-def _preflight(checks: Sequence[FailedCheck], cut: bool) -> DoctorCheck:
-    name = "preflight"
+def _preflight(its: _Judged) -> _Finding:
+    """What else keeps the vehicle from taking off."""
+    known = _failed_checks(its)
+    if isinstance(known, str):
+        return _skipped(known)
+    checks = [check for check in known[0] if check.code not in (*_GROUND, *_SAID_ELSEWHERE)]
     if not checks:
-        return DoctorCheck(name, "ok", "nothing but the ground's commands is missing")
+        return _ok("nothing but the ground's commands is missing")
     # Before the vehicle stands under open sky, this is how it is; PX4 does not arm then.
     settling = {check.code for check in checks if check.settles_by_itself}
     may_arm_then = bool(settling - {CheckCode.CHECKS_RUNNING})
@@ -756,10 +712,34 @@ def _preflight(checks: Sequence[FailedCheck], cut: bool) -> DoctorCheck:
         check.code in settling or (may_arm_then and check.code is CheckCode.NOT_ARMABLE)
         for check in checks
     )
-    found = texts(checks) + ("; perhaps more" if cut else "")
+    found = texts(checks) + ("" if known[1] else "; perhaps more")
     if waits:
-        return DoctorCheck(name, "warning", found, "wait under open sky, then try again")
-    return DoctorCheck(name, "FAILED", found, "mend what each line says")
+        return _warning(found, "wait under open sky, then try again")
+    return _failed(found, "mend what each line says")
+
+
+_CHECKS: dict[str, Callable[[_Judged], _Finding | None]] = {
+    "enrolled": _identity,
+    "card": _card,
+    "group key": _group,
+    "release": _release,
+    "program": _program,
+    "system": _system,
+    "disk": _disk,
+    "clock": _clock,
+    "processor": _processor,
+    "memory": _memory,
+    "wifi": _wifi,
+    "radio": _radio,
+    "mavlink": _mavlink,
+    "px4": _px4,
+    "vision-hub": _vision_hub,
+    "doors": _doors,
+    "commanders": _commanders,
+    "containers": _containers,
+    "failsafe": _failsafe,
+    "preflight": _preflight,
+}
 
 
 def _numbers(version: str) -> tuple[int, int]:
@@ -769,10 +749,8 @@ def _numbers(version: str) -> tuple[int, int]:
 
 def _duration(seconds: float) -> str:
     """In the unit that a person would take."""
-    if seconds < 1.0:
-        return f"{1000.0 * seconds:.0f} ms"
-    if seconds < 120.0:
-        return f"{seconds:.1f} s"
-    if seconds < 172800.0:
-        return f"{seconds / 3600.0:.1f} h"
+    for limit_s, unit_s, text in ((1.0, 1e-3, "{:.0f} ms"), (120.0, 1.0, "{:.1f} s"),
+                                  (172800.0, 3600.0, "{:.1f} h")):  # fmt: skip
+        if seconds < limit_s:
+            return text.format(seconds / unit_s)
     return f"{seconds / 86400.0:.0f} days"
