@@ -203,7 +203,7 @@ def test_a_wrong_clock(config: FleetConfig, ahead_s: float, verdict: str, found:
 def test_with_multicast_no_robot_is_connected_to_another(config: FleetConfig) -> None:
     for radio, verdict, fix in (
         (RadioConfig("multicast"), "ok", ""),
-        (RadioConfig("mesh"), "warning", "lpac fleet ping"),
+        (RadioConfig("mesh"), "warning", "lpac fleet radio"),
     ):
         its = dataclasses.replace(config, radio=radio)
         fleet = {name: well(its, name) for name in ("r1", "r2", "r3")}
