@@ -265,27 +265,31 @@ class _Judged:
 
 
 # What a check comes to: verdict, what was found, and the fix.
-_Finding = tuple[Verdict, str, str]
+Finding = tuple[Verdict, str, str]
 
 
-def _ok(found: str) -> _Finding:
+def ok(found: str) -> Finding:
+    """What was looked at is well."""
     return "ok", found, ""
 
 
-def _skipped(found: str) -> _Finding:
+def skipped(found: str) -> Finding:
+    """What cannot be looked at, or is not there."""
     return "skipped", found, ""
 
 
-def _warning(found: str, fix: str) -> _Finding:
+def warning(found: str, fix: str) -> Finding:
+    """What does not keep a robot from flying."""
     return "warning", found, fix
 
 
-def _failed(found: str, fix: str) -> _Finding:
+def failed(found: str, fix: str) -> Finding:
+    """What keeps a robot from flying."""
     return "FAILED", found, fix
 
 
-def _graded(found: str, fix: str, *, bad: bool, poor: bool) -> _Finding:
-    return _failed(found, fix) if bad else _warning(found, fix) if poor else _ok(found)
+def _graded(found: str, fix: str, *, bad: bool, poor: bool) -> Finding:
+    return failed(found, fix) if bad else warning(found, fix) if poor else ok(found)
 
 
 def judge(
@@ -317,42 +321,42 @@ def _reach_fix(config: FleetConfig, robot: RobotHost) -> str:
     return f"switch {robot.name} on, look at its Wi-Fi, then try: {shlex.join(ssh)}"
 
 
-def _identity(its: _Judged) -> _Finding:
+def _identity(its: _Judged) -> Finding:
     if its.facts["identity"] is None:
-        return _failed("it was never enrolled", its.enroll)
+        return failed("it was never enrolled", its.enroll)
     wrong = wrong_identity(its.facts["identity"], its.config, its.robot)
     if wrong is not None:
-        return _failed(*wrong)
-    return _ok(f"robot id {its.robot.robot_id} of fleet {its.config.fleet}")
+        return failed(*wrong)
+    return ok(f"robot id {its.robot.robot_id} of fleet {its.config.fleet}")
 
 
-def _card(its: _Judged) -> _Finding:
+def _card(its: _Judged) -> Finding:
     if its.config.keys is None:
         found = "insecure: whoever is on the network can fly it"
-        return _warning(found, f"take insecure out of {its.config.path.name}")
+        return warning(found, f"take insecure out of {its.config.path.name}")
     if its.facts["card"] is None:
-        return _failed("it has no card of the fleet", its.enroll)
+        return failed("it has no card of the fleet", its.enroll)
     try:
         own = card_in(its.facts["card"], its.config.keys)
     except (OSError, ConfigError) as error:
-        return _failed(str(error), its.enroll)
+        return failed(str(error), its.enroll)
     if own.robot_id != its.robot.robot_id:
-        return _failed(f"its card is {own.name}'s", its.enroll)
+        return failed(f"its card is {own.name}'s", its.enroll)
     until = time.strftime("%Y-%m-%d", time.gmtime(own.expires_unix_s))
-    return _ok(f"a member of fleet {own.fleet} until {until}")
+    return ok(f"a member of fleet {own.fleet} until {until}")
 
 
-def _group(its: _Judged) -> _Finding | None:
+def _group(its: _Judged) -> Finding | None:
     """Whether it has the key that the others have: by it robots hear each other in multicast."""
     if its.config.radio.transport != "multicast" or its.config.keys is None:
         return None
     has = {other: of["group_keys"] for other, of in its.fleet.items() if of["group_keys"]}
     if its.robot.name not in has:
-        return _failed("it has none: its program does not start", _UP)
+        return failed("it has none: its program does not start", _UP)
     if others := _others_than_most(has, its.robot.name):
         found = f"it has another one than {', '.join(others)}: not all of them hear each other"
-        return _failed(found, _UP)
-    return _ok(f"it has one, and so have {len(has)} of {counted(len(its.fleet), 'robot')}")
+        return failed(found, _UP)
+    return ok(f"it has one, and so have {len(has)} of {counted(len(its.fleet), 'robot')}")
 
 
 def _others_than_most(has: Mapping[str, Any], robot: str) -> list[str]:
@@ -366,21 +370,21 @@ def _others_than_most(has: Mapping[str, Any], robot: str) -> list[str]:
     return [other for other, its in has.items() if its != has[robot]]
 
 
-def _release(its: _Judged) -> _Finding:
+def _release(its: _Judged) -> Finding:
     if its.facts["pending"] is not None:
-        return _failed("a switch of releases was interrupted", _UP)
+        return failed("a switch of releases was interrupted", _UP)
     if its.facts["current"] is None or its.facts["versions"] is None:
-        return _failed("there is none", its.command("deploy"))
+        return failed("there is none", its.command("deploy"))
     versions = {other: of["versions"] for other, of in its.fleet.items() if of["versions"]}
     for part in ("image", "bundle", "world"):
         has = {other: str(of.get(part)) for other, of in versions.items()}
         if others := _others_than_most(has, its.robot.name):
             found = f"its {part} is {has[its.robot.name][:12]}, another one than that of "
-            return _failed(found + ", ".join(others), "lpac fleet deploy")
+            return failed(found + ", ".join(others), "lpac fleet deploy")
     if not is_configured(its.config, its.robot, its.facts):
         found = f"its configuration is not the one of {its.config.path.name}"
-        return _failed(found, its.command("deploy"))
-    return _ok(its.facts["current"])
+        return failed(found, its.command("deploy"))
+    return ok(its.facts["current"])
 
 
 def is_configured(config: FleetConfig, robot: RobotHost, overview: Facts) -> bool:
@@ -394,48 +398,48 @@ def is_configured(config: FleetConfig, robot: RobotHost, overview: Facts) -> boo
     return bool(overview["robot_toml"] == hashlib.sha256(text.encode()).hexdigest())
 
 
-def _program(its: _Judged) -> _Finding:
+def _program(its: _Judged) -> Finding:
     service = its.service
     if its.facts["current"] is None:
-        return _skipped("it has no release")
+        return skipped("it has no release")
     if its.config.slot_of(its.robot.name) is None:
         if service["active"] == "active":
-            return _failed("it is a spare, and its program runs", its.command("deploy"))
-        return _ok("spare: not started")
+            return failed("it is a spare, and its program runs", its.command("deploy"))
+        return ok("spare: not started")
     start, logs = its.command("start"), its.command("logs")
     if service["active"] != "active":
-        return _failed(f"it is {service['active']} ({service['result']})", start)
+        return failed(f"it is {service['active']} ({service['result']})", start)
     if not service["fresh"]:
-        return _failed("it runs, and says nothing", logs)
+        return failed("it runs, and says nothing", logs)
     if not service["enabled"]:
-        return _warning("it does not start after a battery swap", start)
+        return warning("it does not start after a battery swap", start)
     if service["restarts"]:
-        return _warning(f"it was restarted {service['restarts']} times", logs)
+        return warning(f"it was restarted {service['restarts']} times", logs)
     state, peers = service["status"]["state"], service["status"]["peers"]
     if its.config.radio.transport == "multicast":  # Grounds alone connect: there may be none now.
-        return _ok(f"runs: {state}")
+        return ok(f"runs: {state}")
     wanted = sum(bool(of["service"]["fresh"]) for of in its.fleet.values()) - 1
     if peers < wanted:
         found = f"it is connected to {peers} of the {wanted} other programs"
-        return _warning(found, "lpac fleet radio")
-    return _ok(f"runs: {state}, {peers} peers")
+        return warning(found, "lpac fleet radio")
+    return ok(f"runs: {state}, {peers} peers")
 
 
-def _system(its: _Judged) -> _Finding:
+def _system(its: _Judged) -> Finding:
     facts, systemd = its.facts, its.facts["systemd"]
     found = f"Linux {facts['kernel']}, systemd {systemd}, Python {facts['python']}"
     found += f", SDK {facts['sdk']}" if facts["sdk"] else ""
     if _numbers(facts["python"]) < _LEAST_PYTHON or systemd is None or systemd < _LEAST_SYSTEMD:
         fix = "the robot needs Python 3.6 and systemd 237 or newer: update its system"
-        return _failed(found, fix)
+        return failed(found, fix)
     if not facts["rsync"]:
-        return _failed("rsync is missing", "install rsync on the robot")
+        return failed("rsync is missing", "install rsync on the robot")
     if _numbers(facts["kernel"]) < _LEAST_KERNEL:
-        return _warning(f"{found}: older than what is known to work", "update it")
-    return _ok(found)
+        return warning(f"{found}: older than what is known to work", "update it")
+    return ok(found)
 
 
-def _disk(its: _Judged) -> _Finding:
+def _disk(its: _Judged) -> Finding:
     least = min(its.facts["disks"], key=lambda disk: float(disk["free_bytes"]))
     free_mb, total_mb = least["free_bytes"] / _MB, least["total_bytes"] / _MB
     fix = (
@@ -448,7 +452,7 @@ def _disk(its: _Judged) -> _Finding:
     )  # fmt: skip
 
 
-def _clock(its: _Judged) -> _Finding:
+def _clock(its: _Judged) -> Finding:
     offset_s, uncertainty_s = its.found.clock
     way = "ahead of" if offset_s > 0.0 else "behind"
     found = f"{_duration(abs(offset_s))} {way} the laptop's (± {1000.0 * uncertainty_s:.0f} ms)"
@@ -459,31 +463,31 @@ def _clock(its: _Judged) -> _Finding:
     )
 
 
-def _processor(its: _Judged) -> _Finding:
+def _processor(its: _Judged) -> Finding:
     cores = f"{its.facts['cpus']} cores, load {its.facts['load']:.1f}"
     hottest_c = its.facts["hottest_c"]
     if hottest_c is None:
-        return _ok(f"{cores}, temperature not known")
+        return ok(f"{cores}, temperature not known")
     slows = ": it slows down near 90 °C" if hottest_c >= _WARM_C else ""
     fix = "let it cool, with wind on it; switch it on later"
     found = f"{cores}, {hottest_c:.0f} °C{slows}"
     return _graded(found, fix, bad=hottest_c >= _HOT_C, poor=hottest_c >= _WARM_C)
 
 
-def _memory(its: _Judged) -> _Finding:
+def _memory(its: _Judged) -> Finding:
     memory = its.facts["memory"]
     if memory is None:
-        return _skipped("not known")
+        return skipped("not known")
     free_mb, total_mb = memory["available_bytes"] / _MB, memory["total_bytes"] / _MB
     fix = "stop what takes it (`top` on the robot), or switch the robot off and on"
     found = f"{free_mb:.0f} of {total_mb:.0f} MB available"
     return _graded(found, fix, bad=free_mb < _LEAST_MEMORY_MB, poor=free_mb < _GOOD_MEMORY_MB)
 
 
-def _wifi(its: _Judged) -> _Finding:
+def _wifi(its: _Judged) -> Finding:
     links = its.facts["wifi"]
     if not links:
-        return _skipped("no wireless interface: wired, or its driver does not say")
+        return skipped("no wireless interface: wired, or its driver does not say")
     link = max(links, key=lambda each: (each["connected"] is True, each["signal_dbm"] is not None))
     name, signal_dbm, rate_mbit_s = link["name"], link["signal_dbm"], link["rate_mbit_s"]
     words = [str(link["network"] or name)]
@@ -492,80 +496,80 @@ def _wifi(its: _Judged) -> _Finding:
     words += ["power save on"] if link["power_save"] else []
     found = ", ".join(words)
     if link["connected"] is False:
-        return _warning(f"{name} is not connected", "join the fleet's Wi-Fi")
+        return warning(f"{name} is not connected", "join the fleet's Wi-Fi")
     if link["power_save"]:
         fix = its.on(f"iw dev {name} set power_save off")
-        return _warning(f"{found}: messages are late", f"{fix} (at every boot)")
+        return warning(f"{found}: messages are late", f"{fix} (at every boot)")
     if signal_dbm is not None and signal_dbm < _WEAK_DBM:
-        return _warning(f"{found}: weak", "bring the access point nearer, or higher")
-    return _ok(found)
+        return warning(f"{found}: weak", "bring the access point nearer, or higher")
+    return ok(found)
 
 
-def _radio(its: _Judged) -> _Finding:
+def _radio(its: _Judged) -> Finding:
     pings = its.found.pings
     if isinstance(pings, str):
-        return _skipped(pings)
+        return skipped(pings)
     # A robot that is off is its own fault, not that of all others.
     heard = {other: ping for other, ping in pings.items() if other in its.fleet}
     if not heard:
-        return _skipped("no other robot answers")
+        return skipped("no other robot answers")
     fix = (
         "lpac fleet radio; all must be in one network, and the access point must let its clients "
         "reach each other"
     )
     if deaf := [other for other, ping in heard.items() if ping["loss"] >= 1.0]:
-        return _failed(f"no answer from {', '.join(deaf)}", fix)
+        return failed(f"no answer from {', '.join(deaf)}", fix)
     bad = [
         f"{other}: {100.0 * ping['loss']:.0f} % lost, {ping['mean_ms']:.0f} ms"
         for other, ping in heard.items()
         if ping["loss"] > _LOST_TOO_MUCH or ping["mean_ms"] > _SLOW_MS
     ]
     if bad:
-        return _warning("; ".join(bad), fix)
+        return warning("; ".join(bad), fix)
     slowest_ms = max(ping["mean_ms"] for ping in heard.values())
-    return _ok(f"{counted(len(heard), 'robot')}: slowest answer within {slowest_ms:.1f} ms")
+    return ok(f"{counted(len(heard), 'robot')}: slowest answer within {slowest_ms:.1f} ms")
 
 
-def _mavlink(its: _Judged) -> _Finding:
+def _mavlink(its: _Judged) -> Finding:
     robot, status, beat = its.robot, its.service["status"], its.facts["heartbeat"]
     runs, port = its.service["fresh"], robot.mavlink_port
     fix = its.on("systemctl status voxl-px4 voxl-mavlink-server voxl-vision-hub")
     if runs and not status["autopilot"]:
         about = [c.text for c in _told(status["failed_checks"]) if c.code in _NO_AUTOPILOT]
-        return _failed(about[0] if about else "the autopilot is silent", fix)
+        return failed(about[0] if about else "the autopilot is silent", fix)
     if its.service["active"] == "active" and not runs:
-        return _skipped("the robot's program has the port, and says nothing")
+        return skipped("the robot's program has the port, and says nothing")
     if not runs and beat is None:
-        return _failed(f"no heartbeat of PX4 at UDP port {port}", fix)
+        return failed(f"no heartbeat of PX4 at UDP port {port}", fix)
     system_id = status["system_id"] if runs else beat["system_id"]
     if system_id != robot.system_id:
         found = f"PX4 has system id {system_id}, configured is {robot.system_id}"
-        return _failed(found, f"{its.enroll} (it sets MAV_SYS_ID)")
-    return _ok(f"PX4 answers at port {port}, system id {system_id}")
+        return failed(found, f"{its.enroll} (it sets MAV_SYS_ID)")
+    return ok(f"PX4 answers at port {port}, system id {system_id}")
 
 
-def _px4(its: _Judged) -> _Finding:
+def _px4(its: _Judged) -> Finding:
     parts = {part: of for part, of in its.facts["units"].items() if part in _PX4_PARTS}
     version = its.facts["px4"]
     if not any(of["there"] for of in parts.values()) and version is None:
-        return _skipped("not a VOXL2: there is no voxl-px4")
+        return skipped("not a VOXL2: there is no voxl-px4")
     if idle := [part for part, of in parts.items() if not of["active"]]:
         fix = its.on(f"systemctl enable --now {' '.join(idle)}")
-        return _failed(f"{', '.join(idle)} does not run", fix)
+        return failed(f"{', '.join(idle)} does not run", fix)
     if version is None:
-        return _skipped("its services run; its version is not known to dpkg")
+        return skipped("its services run; its version is not known to dpkg")
     if _numbers(version) < _LEAST_PX4:
-        return _failed(f"PX4 {version} is older than 1.14", "update the VOXL SDK")
-    return _ok(f"PX4 {version}")
+        return failed(f"PX4 {version} is older than 1.14", "update the VOXL SDK")
+    return ok(f"PX4 {version}")
 
 
-def _vision_hub(its: _Judged) -> _Finding:
+def _vision_hub(its: _Judged) -> Finding:
     found = its.facts["vision_hub"]
     if found is None:
-        return _skipped("there is no voxl-vision-hub")
+        return skipped("there is no voxl-vision-hub")
     fix = f"{its.enroll} (it writes /etc/modalai/voxl-vision-hub.conf)"
     if "problem" in found:
-        return _failed(str(found["problem"]), fix)
+        return failed(str(found["problem"]), fix)
     faults = []
     mode, port = found["offboard_mode"], found["localhost_udp_port_number"]
     if mode != "off":
@@ -576,16 +580,16 @@ def _vision_hub(its: _Judged) -> _Finding:
     if port not in (None, its.robot.mavlink_port):
         faults.append(f"PX4 comes to UDP port {port}, configured is {its.robot.mavlink_port}")
     if faults:
-        return _failed("; ".join(faults), fix)
-    return _ok("offboard_mode is off, MAVLink comes to this host")
+        return failed("; ".join(faults), fix)
+    return ok("offboard_mode is off, MAVLink comes to this host")
 
 
-def _doors(its: _Judged) -> _Finding:
+def _doors(its: _Judged) -> Finding:
     """Ways to the vehicle past the fleet's keys."""
     robot, radio = its.robot, its.config.radio
     if users := its.facts["factory_passwords"]:
         found = f"{', '.join(users)}: no password, or the one that every VOXL comes with"
-        return _failed(found, its.on(*(f"passwd {user}" for user in users)))
+        return failed(found, its.on(*(f"passwd {user}" for user in users)))
     # Members knock at the UDP port of the radio's number.
     expected = {("tcp", robot.port or 22), ("tcp", robot.zenoh_port), ("udp", robot.zenoh_port)}
     if radio.transport == "multicast":
@@ -596,18 +600,18 @@ def _doors(its: _Judged) -> _Finding:
         found = f"others on the network may reach PX4's MAVLink: {_ports(mavlink)}"
         drop = "iptables -I INPUT ! -i lo -p udp --dport {} -j DROP"
         fix = its.on(*(drop.format(each["port"]) for each in mavlink))
-        return _warning(found, f"{fix} (at every boot)")
+        return warning(found, f"{fix} (at every boot)")
     if others:
         found = f"other programs listen to the network: {_ports(others)}"
-        return _warning(found, "stop what the fleet does not need")
+        return warning(found, "stop what the fleet does not need")
     found = "ssh and the radio alone listen to the network"
     if its.config.keys is None:
-        return _ok(found)
+        return ok(found)
     if not its.facts["drops_strangers"]:
         found += "; whoever floods the radio's port closes it: the kernel lets root alone filter"
         allow = "keep strangers out of the Wi-Fi, or let the program filter: docs/security.md"
-        return _warning(found, allow)
-    return _ok(f"{found}; the kernel drops strangers who flood it")
+        return warning(found, allow)
+    return ok(f"{found}; the kernel drops strangers who flood it")
 
 
 def _may_be_mavlink(port: Facts) -> bool:
@@ -620,7 +624,7 @@ def _ports(ports: Sequence[Facts]) -> str:
     return ", ".join(f"{each['protocol']} {each['port']} ({each['program']})" for each in ports)
 
 
-def _commanders(its: _Judged) -> _Finding:
+def _commanders(its: _Judged) -> Finding:
     """Units of others that may send setpoints."""
     units = its.facts["units"]
     suspects = [*_COMMANDERS, *(name.removesuffix(".service") for name in its.config.predecessors)]
@@ -630,14 +634,14 @@ def _commanders(its: _Judged) -> _Finding:
     ):
         if bad := [name for name in suspects if units.get(name, {}).get(state)]:
             fix = its.on(f"systemctl disable{option} {' '.join(bad)}")
-            return _failed(f"{', '.join(bad)} {found}", fix)
-    return _ok("no other program that is known to command PX4 runs")
+            return failed(f"{', '.join(bad)} {found}", fix)
+    return ok("no other program that is known to command PX4 runs")
 
 
-def _containers(its: _Judged) -> _Finding:
+def _containers(its: _Judged) -> Finding:
     containers = its.facts["containers"]
     if containers is None:
-        return _warning("there is docker, and it does not answer", its.on("docker ps --all"))
+        return warning("there is docker, and it does not answer", its.on("docker ps --all"))
     bad = {}
     for container in containers:
         why = _why_suspect(container, its.config.predecessors)
@@ -648,9 +652,9 @@ def _containers(its: _Judged) -> _Finding:
     if bad:
         names = " ".join(bad)
         fix = its.on(f"docker update --restart=no {names}", f"docker stop {names}")
-        return _failed("; ".join(bad.values()) + ": it could command the vehicle", fix)
+        return failed("; ".join(bad.values()) + ": it could command the vehicle", fix)
     running = sum(bool(container["running"]) for container in containers)
-    return _ok(f"{running} run, none that could command the vehicle")
+    return ok(f"{running} run, none that could command the vehicle")
 
 
 def _why_suspect(container: Facts, predecessors: Sequence[str]) -> str:
@@ -680,31 +684,31 @@ def _told(told: Sequence[Facts]) -> list[FailedCheck]:
     ]
 
 
-def _failsafe(its: _Judged) -> _Finding:
+def _failsafe(its: _Judged) -> Finding:
     """PX4's failsafe parameters."""
     known = _failed_checks(its)
     if isinstance(known, str):
-        return _skipped(known)
+        return skipped(known)
     checks, is_all = known
     not_read = (*_NO_AUTOPILOT, CheckCode.CHECKS_RUNNING, CheckCode.FAILSAFE_NOT_READ)
     if any(check.code in not_read for check in checks):
-        return _warning("PX4's parameters were not read", "try again")
+        return warning("PX4's parameters were not read", "try again")
     if wrong := [check for check in checks if check.code is CheckCode.FAILSAFE_WRONG]:
-        return _failed(texts(wrong), f"{its.enroll} (it sets them, and restarts PX4 if need be)")
+        return failed(texts(wrong), f"{its.enroll} (it sets them, and restarts PX4 if need be)")
     if not is_all:
         found = "not among the first failed checks: there may be more"
-        return _warning(found, "mend what `preflight` names, then try again")
-    return _ok("PX4's parameters are as they must be")
+        return warning(found, "mend what `preflight` names, then try again")
+    return ok("PX4's parameters are as they must be")
 
 
-def _preflight(its: _Judged) -> _Finding:
+def _preflight(its: _Judged) -> Finding:
     """What else keeps the vehicle from taking off."""
     known = _failed_checks(its)
     if isinstance(known, str):
-        return _skipped(known)
+        return skipped(known)
     checks = [check for check in known[0] if check.code not in (*_GROUND, *_SAID_ELSEWHERE)]
     if not checks:
-        return _ok("nothing but the ground's commands is missing")
+        return ok("nothing but the ground's commands is missing")
     # Before the vehicle stands under open sky, this is how it is; PX4 does not arm then.
     settling = {check.code for check in checks if check.settles_by_itself}
     may_arm_then = bool(settling - {CheckCode.CHECKS_RUNNING})
@@ -714,11 +718,11 @@ def _preflight(its: _Judged) -> _Finding:
     )
     found = texts(checks) + ("" if known[1] else "; perhaps more")
     if waits:
-        return _warning(found, "wait under open sky, then try again")
-    return _failed(found, "mend what each line says")
+        return warning(found, "wait under open sky, then try again")
+    return failed(found, "mend what each line says")
 
 
-_CHECKS: dict[str, Callable[[_Judged], _Finding | None]] = {
+_CHECKS: dict[str, Callable[[_Judged], Finding | None]] = {
     "enrolled": _identity,
     "card": _card,
     "group key": _group,

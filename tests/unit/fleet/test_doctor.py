@@ -28,7 +28,7 @@ from lpac.fleet.doctor import (
     measure_clock,
     on,
 )
-from lpac.fleet.laptop import iptables_blocks, nft_blocks, rsync_version
+from lpac.fleet.laptop import rsync_version
 from lpac.fleet.operations import Outcome
 from lpac.fleet.settings import FleetConfig, RadioConfig, RobotHost, SshConfig, load_fleet
 from lpac.fleet.up import decide, packs
@@ -489,6 +489,9 @@ LAPTOP = {
 }
 
 
+NFT = '{"nftables": [{"table": {}}, {"chain": {"hook": "output", "policy": "drop"}}]}'
+
+
 @pytest.mark.parametrize(
     ("said", "name", "verdict", "found"),
     [
@@ -500,8 +503,11 @@ LAPTOP = {
         ({"suspend.target": "LoadState=loaded"}, "sleep", "warning", "it may sleep"),
         ({}, "clock", "ok", "set by a time server"),
         ({"timedatectl": "no"}, "clock", "warning", "no time server has set it"),
-        ({}, "firewall", "ok", "nothing that blocks TCP port 7447"),
-        ({"iptables": "-P INPUT DROP"}, "firewall", "FAILED", "it blocks input of TCP port 7447"),
+        ({}, "firewall", "ok", "what goes out is not dropped"),
+        # As ufw has it: nobody connects to the laptop.
+        ({"iptables": "-P INPUT DROP"}, "firewall", "ok", "what goes out is not dropped"),
+        ({"iptables": "-P OUTPUT DROP"}, "firewall", "warning", "drops by default what goes out"),
+        ({"nft": NFT}, "firewall", "warning", "drops by default what goes out"),
         ({"iptables": "", "nft": ""}, "firewall", "skipped", "neither nft nor iptables"),
     ],
 )
@@ -533,76 +539,3 @@ def test_rsync_version() -> None:
     assert rsync_version("rsync  version 3.1.2  protocol version 31\n") == (3, 1)
     assert rsync_version("rsync  version v3.4.1  protocol version 32\n") == (3, 4)
     assert rsync_version("openrsync: protocol version 29\n") is None
-
-
-UFW = """-P INPUT DROP
--P FORWARD DROP
--P OUTPUT ACCEPT
--N ufw-user-input
--A INPUT -i lo -j ACCEPT
--A INPUT -m conntrack --ctstate RELATED,ESTABLISHED -j ACCEPT
--A INPUT -j ufw-user-input
--A ufw-user-input -p tcp -m tcp --dport 22 -j ACCEPT
-"""
-
-
-def test_iptables_rules() -> None:
-    assert iptables_blocks(UFW, [7447]) == ["input"]
-    opened = UFW + "-A ufw-user-input -p tcp -m multiport --dports 80,7000:7999 -j ACCEPT\n"
-    assert iptables_blocks(opened, [7447]) == []
-    assert iptables_blocks("-P INPUT ACCEPT\n-P OUTPUT ACCEPT\n", [7447]) == []
-    for rules in (
-        "-P INPUT DROP\n-A INPUT -p all -j ACCEPT\n",
-        "-P INPUT ACCEPT\n-A INPUT -p udp --dport 7447 -j DROP\n",
-        "-P INPUT DROP\n-A INPUT -p tcp --dports 22,7000:7447 -j ACCEPT\n",
-    ):
-        assert iptables_blocks(rules, [7447]) == []
-    # One of the fleet's ports is enough.
-    assert iptables_blocks("-A INPUT -p tcp --dport 7448 -j DROP\n", [7447, 7448]) == ["input"]
-    assert iptables_blocks(
-        "-P OUTPUT ACCEPT\n-A OUTPUT -p tcp --dport 7447 -j REJECT\n", [7447]
-    ) == ["output"]
-
-
-def test_nft_rules() -> None:
-    place = {"family": "inet", "table": "filter"}
-    base = place | {"name": "input", "hook": "input", "policy": "drop"}
-
-    def rule(*expressions: dict[str, Any]) -> dict[str, Any]:
-        return {"rule": place | {"chain": "input", "expr": list(expressions)}}
-
-    def to_port(right: Any) -> dict[str, Any]:
-        left = {"payload": {"protocol": "tcp", "field": "dport"}}
-        return {"match": {"op": "==", "left": left, "right": right}}
-
-    established = {"match": {"op": "in", "left": {"ct": {"key": "state"}}, "right": "established"}}
-    accept = {"accept": None}
-    closed = [{"chain": base}, rule(established, accept), rule(to_port(22), accept)]
-    assert nft_blocks({"nftables": closed}, [7447]) == ["input"]
-    for right in (7447, {"set": [22, 7447]}, {"set": [{"range": [7000, 8000]}]}):
-        opened = [*closed, rule(to_port(right), accept)]
-        assert nft_blocks({"nftables": opened}, [7447]) == []
-    named = {"set": place | {"name": "open", "elem": [22, {"range": [7440, 7450]}]}}
-    opened = [named, *closed, rule(to_port("@open"), accept)]
-    assert nft_blocks({"nftables": opened}, [7447]) == []
-    assert nft_blocks({"nftables": opened}, [7451]) == ["input"]
-    assert nft_blocks({"nftables": opened}, [7440]) == []
-    assert nft_blocks({"nftables": []}, [7447]) == []
-    # A chain that accepts by default, with rules against the port; in another table nothing counts.
-    waved = base | {"policy": "accept"}
-    udp = {"match": {"op": "==", "left": {"meta": {"key": "l4proto"}}, "right": "udp"}}
-    other = rule(accept)
-    other["rule"]["table"] = "nat"
-    inner = {"rule": place | {"chain": "inner", "expr": [to_port(7447), {"reject": None}]}}
-    unless = to_port(22)
-    unless["match"]["op"] = "!="
-    for rules, blocked in (
-        ([rule(to_port(7447), {"reject": None})], True),
-        ([rule(unless, {"drop": None})], True),
-        ([rule(udp, {"drop": None})], False),
-        ([other, rule(to_port(7447), {"drop": None})], True),
-        ([rule({"goto": {"target": "inner"}}), inner], True),
-        ([rule(to_port(7447), {"drop": None}), rule({"xt": None})], False),
-    ):
-        found = nft_blocks({"nftables": [{"chain": waved}, *rules]}, [7447])
-        assert found == (["input"] if blocked else [])
