@@ -157,7 +157,7 @@ def test_what_is_assumed_and_comes_from_the_model_is_called_so(
 
 def test_who_is_not_heard_has_no_figures_and_there_is_no_room_to_tell_of(ask: Ask) -> None:
     result = ask((1, 3), "")
-    assert "radio: r2 is not heard here: `lpac fleet status` tells" in str(result.exception)
+    assert "radio: r2 is not heard here: `lpac fleet status` shows" in str(result.exception)
     assert "room" not in result.stdout
     rows = [line.split() for line in result.stdout.splitlines() if re.match(r"r\d [ \d.-]+$", line)]
     # Of each of three tables; nobody hears itself.
