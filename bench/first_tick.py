@@ -34,8 +34,9 @@ def run(tick: Callable[[], object]) -> None:
 
 def edge() -> Callable[[], object]:
     """Load the bundle and receive from ten neighbours; returns a tick."""
+    from dataclasses import replace
+
     from edge.core.aggregation import AggregatedMessage
-    from edge.core.fleet_time import FleetTime
     from edge.core.frames import ModelScale
     from edge.core.ports import Odometry
     from edge.core.wire import encode
@@ -54,20 +55,16 @@ def edge() -> Callable[[], object]:
     importance = np.ones((perception.world_size,) * 2, np.float32)
     robot = Pac(
         robot_id=0,
-        boot_epoch=1,
         policy=policy,
         sensor=WorldSensor(importance, perception.sensor_size),
         odometry=Standing(),
         parameters=PacParameters(scale=ModelScale(_ENV_SCALE, 0.25), max_speed_m_s=1.25),
     )
     robot.clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
-    payload = np.zeros(policy.message_size, np.float32)
-    time, still = FleetTime(1, 0.0, 0.0), (0.0, 0.0, 0.0)
+    data = encode(AggregatedMessage(np.zeros(policy.message_size, np.float32)), "float16")
     for number, position_m in enumerate(_NEIGHBOURS_M, 1):
-        message = AggregatedMessage(
-            number, 1, 1, time, position_m, velocity_m_s=still, frame_id=0, payload=payload
-        )
-        robot.receive(encode(message, policy.bundle_id, "float16"), now_s=0.0)
+        beacon = replace(robot.beacon(0.0), robot_id=number, position_m=position_m)
+        robot.receive(beacon, (1, 1), data, now_s=0.0)
 
     def tick() -> None:
         robot.perceive(now_s=0.0)

@@ -35,7 +35,6 @@ parameters = PacParameters(
 robots = [
     Pac(
         robot_id=number,
-        boot_epoch=1,
         policy=policy,
         sensor=WorldSensor(importance, perception.sensor_size),
         odometry=VehicleOdometry(vehicles, number),
@@ -49,7 +48,7 @@ for tick in range(10):
         perceived = robot.perceive(now_s)  # view -> map -> images -> 34 features
         did = robot.infer(now_s)  # features and messages -> velocity and an own message
         assert perceived and did  # None where there is no position, view or message
-        robots[1 - number].receive(did.message, now_s)
+        robots[1 - number].receive(robot.beacon(now_s), (1, tick), did.message, now_s)
         velocity_m_s = robot.control(now_s)  # within the speed limit; None if all is too old
         vehicles.fly(number, np.zeros(2) if velocity_m_s is None else velocity_m_s)
         print(

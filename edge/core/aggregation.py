@@ -13,7 +13,6 @@ import numpy as np
 from msgspec import Meta
 
 from edge.core import F32
-from edge.core.fleet_time import FleetTime
 from edge.core.schema import AtLeastOne, Bounded
 from edge.core.shared_map import SharedMap
 
@@ -41,24 +40,14 @@ class Geometry(Bounded):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AggregatedMessage:
-    """A robot's message to its neighbours: Y_j, and its place.
+    """A robot's policy's message to its neighbours: Y_j.
 
     `payload` (message_size,) is float32 or float16: (y_j)_kl in the order [l][k][feature], times
-    1/sqrt(d_j), where d_j is the sender's number of neighbours. `position_m` and `velocity_m_s` are
-    in the mission frame with the id `frame_id` (`MissionFrame.frame_id`). `sent` is the time of
-    sending, None while the sender does not know the time. `boot_epoch` grows with each start of the
-    sender, `sequence` with each message of one start. `shared` is the sender's map of its
+    1/sqrt(d_j), where d_j is the sender's number of neighbours. `shared` is the sender's map of its
     surroundings, if robots share maps, and `trial` the mission of that map: maps of other missions
     are discarded.
     """
 
-    robot_id: int
-    boot_epoch: int
-    sequence: int
-    sent: FleetTime | None
-    position_m: tuple[float, float, float]
-    velocity_m_s: tuple[float, float, float]
-    frame_id: int
     payload: F32
     trial: int = 0
     shared: SharedMap | None = None

@@ -11,10 +11,9 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.fence import Fence
-from edge.core.mailbox import Neighbour
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.silence import SilenceLimits, stops_m, strays_m
-from edge.messages.beacon import Beacon
+from edge.messages.beacon import Beacon, Neighbour
 from edge.messages.mission import FlightState
 
 Point = tuple[float, float]

@@ -10,7 +10,6 @@ from msgspec import Meta
 
 from edge.core.counted import counted
 from edge.core.fence import Fence
-from edge.core.mailbox import Neighbour
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.px4_version import OLDEST, is_too_old
 from edge.core.schema import Bounded, Positive
@@ -21,7 +20,7 @@ from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
 from edge.flight.safety import SeparationLimits
 from edge.flight.silence import highest_still_m, nearest_on_way_m, strays_m
-from edge.messages.beacon import Beacon, HeardBeacon, tag
+from edge.messages.beacon import Beacon, HeardBeacon, Neighbour, tag
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 
@@ -349,7 +348,7 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
         )
     bundle_tag, world_tag = tag(inputs.bundle_id), tag(inputs.world_id)
     frame_id = None if inputs.origin is None else inputs.origin.frame().frame_id
-    for beacon, _ in others:
+    for beacon, *_ in others:
         other = f"robot {beacon.robot_id}"
         if beacon.system_id is not None and beacon.system_id == inputs.system_id:
             yield FailedCheck(

@@ -21,10 +21,10 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.fence import Fence
-from edge.core.mailbox import Neighbour
 from edge.core.schema import Bounded, NonNegative, Positive
 from edge.core.vehicle import Vector
 from edge.flight.silence import SilenceLimits, highest_still_m, nearest_on_way_m, strays_m
+from edge.messages.beacon import Neighbour
 
 _ABSURD = 1e6
 # A slack is used up no faster than in this time: five control periods, which leaves room for the

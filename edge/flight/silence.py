@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
-from edge.core.mailbox import Neighbour
-from edge.messages.beacon import Beacon
+from edge.messages.beacon import Beacon, Neighbour
 from edge.messages.mission import FlightState
 
 # Slower than any landing of PX4's, whose last metres take 0.7 m/s.

@@ -16,7 +16,6 @@ from msgspec import Meta, Struct
 
 from edge.core import F64
 from edge.core.fence import Fence
-from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.schema import Bounded, PointXY, Positive
@@ -28,6 +27,7 @@ from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
 from edge.flight.safety import Closest, MotionLimits, SeparationLimits, stopping_m
 from edge.flight.silence import SilenceLimits
+from edge.messages.beacon import Neighbour
 from edge.messages.codes import FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
     FlightState,

@@ -10,7 +10,7 @@ Little-endian, 29 bytes before the payload, and the signature behind it:
 | 7 | 4 bytes | digest of the sender's list of members; zeros in a fleet without keys |
 | 11 | 8 bytes | the sender's key, by its fingerprint; zeros in a fleet without keys |
 | 19 | uint48 | the start of its program: each is greater than the last |
-| 25 | uint32 | sequence: each is greater than the last of that start on this topic |
+| 25 | uint32 | sequence: one more than the last of that start on this topic |
 | 29 | | the payload |
 | -64 | 64 bytes | Ed25519 signature; nothing in a fleet without keys |
 

@@ -3,7 +3,6 @@
 Who a message is from is decided here, before anything of it is decoded and whatever brought it.
 """
 
-import itertools
 import math
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
@@ -179,8 +178,8 @@ class Unguarded:
 
     def __init__(self, start: int) -> None:
         self._start = start
-        # Its `next` cannot be interrupted.
-        self._sequence = itertools.count(1)
+        self._lock = Lock()
+        self._sequences: Counter[Topic] = Counter()
         self._refused = 0
 
     @property
@@ -197,7 +196,10 @@ class Unguarded:
 
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """See `Guard`."""
-        return enclose(payload, MessageNumber(self._start, next(self._sequence)))
+        with self._lock:
+            self._sequences[topic] += 1
+            sequence = self._sequences[topic]
+        return enclose(payload, MessageNumber(self._start, sequence))
 
     def _receive(self, hear: Hear, key: str, data: bytes) -> bool:
         envelope = read_envelope(data)
@@ -289,7 +291,7 @@ class SignedGuard:
         # The wall clock minus the monotonic one, once it is known.
         self._unix_offset_s: float | None = None
         self._refused: Counter[RefusedMessage] = Counter()
-        self._sequence = 0
+        self._sequences: Counter[str] = Counter()
         self._shown_at_s = self._new_until_s = -math.inf
         # A program that begins is new to all.
         self._show_soon = True
@@ -405,8 +407,8 @@ class SignedGuard:
 
     def _seal(self, key: str, payload: bytes) -> bytes:
         with self._lock:
-            self._sequence += 1
-            sequence = self._sequence
+            self._sequences[key] += 1
+            sequence = self._sequences[key]
         return seal(
             payload,
             signer=self._membership.signer,

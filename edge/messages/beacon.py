@@ -1,34 +1,30 @@
-"""Beacon: what a robot tells its neighbours besides its policy's message, in 64 bytes.
+"""Beacon: header of everything that a robot says to robots.
 
-A robot's message is a beacon, and behind it what its policy says (see `edge.core.wire`); while the
-policy is silent, the beacon alone. So neighbours keep apart, and compare themselves before a
-flight, without hearing each other's statuses.
+Behind it is what the robot's policy says (`edge.core.wire`); while the policy is silent, nothing.
+Who says it, which start of its program, and the message's number are in the envelope. So neighbours
+keep apart, and compare themselves before a flight, without hearing each other's statuses.
 
 Little-endian:
 
 | offset | type | field | unit |
 | --- | --- | --- | --- |
-| 0 | 2 bytes | magic, `LB` | |
-| 2 | uint8 | version of this layout, 1 | |
-| 3 | uint16 | robot id | |
-| 5 | uint48 | boot epoch | |
-| 11 | uint32 | sequence | |
-| 15 | uint48 | send time, Unix | ms |
-| 21 | 3 x int24 | position x, y, z in the mission frame | cm |
-| 30 | 3 x int16 | velocity x, y, z in the mission frame | cm/s |
-| 36 | uint8 | flight state, by its place in `FlightState` | |
-| 37 | uint8 | bits: 1 armed, 2 disarmed, 4 position and velocity known | |
-| 38 | uint8 | system id of its vehicle, 0 if not known | |
-| 39 | uint16 | accuracy that its receiver reports, rounded up; 65535 if none | cm |
-| 41 | uint16 | since it was armed; 65535 if not known | s |
-| 43 | int24 | slot height | mm |
-| 46 | 2 x int24 | landing point x, y | mm |
-| 52 | uint32 | the mission frame's `frame_id`, 0 if none is set | |
-| 56 | uint16 | `tag` of the bundle's id | |
-| 58 | uint16 | `tag` of the world's id | |
-| 60 | uint32 | CRC-32 (zlib) of all other bytes | |
+| 0 | 3 x int32 | position x, y, z in the mission frame | mm |
+| 12 | 3 x int16 | velocity x, y, z in the mission frame | cm/s |
+| 18 | uint8 | flight state, by its place in `FlightState` | |
+| 19 | uint8 | bits: 1 armed, 2 disarmed, 4 position and velocity known | |
+| 20 | uint8 | system id of its vehicle, 0 if not known | |
+| 21 | uint16 | accuracy that its receiver reports, rounded up; 65535 if none | cm |
+| 23 | uint16 | since it was armed; 65535 if not known | s |
+| 25 | int32 | slot height | mm |
+| 29 | 2 x int32 | landing point x, y | mm |
+| 37 | uint32 | the mission frame's `frame_id`, 0 if none is set | |
+| 41 | uint32 | `tag` of the bundle's id | |
+| 45 | uint32 | `tag` of the world's id | |
+| 49 | uint32 | which ground's clock, 0 if none is known | |
+| 53 | float64 | send time by that clock | s |
+| 61 | float32 | how wrong the send time may be | s |
 
-What is out of a field's range is said as the field's greatest or least.
+What is out of a field's bounds is said as the field's greatest or least, and refused if heard.
 """
 
 import functools
@@ -38,60 +34,108 @@ import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from edge.core.fleet_time import FleetTime
 from edge.core.vehicle import Vector
 from edge.messages.codec import MessageError
 from edge.messages.mission import FlightState
 
-BEACON_BYTES = 64
-_HEAD = b"LB\x01"
-_CRC_AT = 60
-_FIELDS = struct.Struct("<3xH6sI6s9s3h3B2H3s6sI2HI")
-assert _FIELDS.size == BEACON_BYTES
 _STATES = tuple(FlightState)
 _ARMED, _DISARMED, _PLACED = 1, 2, 4
 _UNKNOWN = 65_535
 
 
-@dataclass(frozen=True, slots=True)
-class Beacon:
-    """A robot's own state; positions as in `RobotStatus`, to 1 cm, heights to 1 mm.
+class _Number(NamedTuple):
+    """A field: its type, how many of its steps are one of its unit, and its bounds."""
 
-    `bundle_tag` and `world_tag` are the `tag`s of what it flies by; `frame_id` is 0 as long as it
-    has no mission origin.
+    code: str
+    steps: int
+    least: float
+    greatest: float
+
+
+_METRES = _Number("i", 1000, -1e6, 1e6)
+_METRES_PER_SECOND = _Number("h", 100, -327.67, 327.67)
+_TAG = _Number("I", 1, 0, 2**32 - 1)
+_FIELDS = {
+    "x_m": _METRES,
+    "y_m": _METRES,
+    "z_m": _METRES,
+    "vx_m_s": _METRES_PER_SECOND,
+    "vy_m_s": _METRES_PER_SECOND,
+    "vz_m_s": _METRES_PER_SECOND,
+    "state": _Number("B", 1, 0, len(_STATES) - 1),
+    "bits": _Number("B", 1, 0, 7),
+    "system_id": _Number("B", 1, 0, 255),
+    "accuracy_cm": _Number("H", 1, 0, _UNKNOWN),
+    "flown_s": _Number("H", 1, 0, _UNKNOWN),
+    "slot_height_m": _METRES,
+    "landing_x_m": _METRES,
+    "landing_y_m": _METRES,
+    "frame_id": _TAG,
+    "bundle_tag": _TAG,
+    "world_tag": _TAG,
+    "time_base": _TAG,
+    "time_s": _Number("d", 1, -1e9, 1e9),
+    "time_uncertainty_s": _Number("f", 1, 0, 1e9),
+}
+_STRUCT = struct.Struct("<" + "".join(number.code for number in _FIELDS.values()))
+BEACON_BYTES = _STRUCT.size
+_NO_TIME = FleetTime(0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beacon:
+    """A robot's own state; positions as in `RobotStatus`, to 1 mm.
+
+    `sent` is when, None as long as the sender does not know the time. `bundle_tag` and `world_tag`
+    are the `tag`s of what it flies by; `frame_id` is 0 as long as it has no mission origin.
     """
 
     robot_id: int
-    boot_epoch: int
-    sequence: int
-    sent_at_s: float
+    sent: FleetTime | None
     position_m: Vector | None
     velocity_m_s: Vector | None
-    state: FlightState
-    armed: bool | None
-    system_id: int | None
-    gps_accuracy_m: float | None
-    flown_s: float | None
-    slot_height_m: float
-    landing_point_m: tuple[float, float]
     frame_id: int
     bundle_tag: int
-    world_tag: int
+    world_tag: int = 0
+    state: FlightState = FlightState.INIT
+    armed: bool | None = None
+    system_id: int | None = None
+    gps_accuracy_m: float | None = None
+    flown_s: float | None = None
+    slot_height_m: float = 0.0
+    landing_point_m: tuple[float, float] = (0.0, 0.0)
 
 
 class HeardBeacon(NamedTuple):
-    """Another robot's, and when it came by this robot's monotonic clock, s."""
+    """Another robot's; when it came, and since when it may be on its way: monotonic clock, s."""
 
     beacon: Beacon
     heard_at_s: float
+    sent_at_s: float
+
+
+class Neighbour(NamedTuple):
+    """Another robot: its position and velocity in the mission frame, as they were `age_s` ago.
+
+    `is_piloted`: somebody else than its program flies it, or it does not hold its height, so that
+    nobody knows where it flies next.
+    """
+
+    robot_id: int
+    position_m: Vector
+    velocity_m_s: Vector
+    age_s: float
+    is_piloted: bool = False
 
 
 def tag(name: str) -> int:
-    """16 bits of a bundle's or a world's id, to tell whether two robots have the same."""
-    return zlib.crc32(name.encode()) & 0xFFFF
+    """32 bits of a bundle's or a world's id, to tell whether two robots have the same."""
+    return zlib.crc32(name.encode())
 
 
 def encode_beacon(beacon: Beacon) -> bytes:
-    """The 64 bytes."""
+    """The bytes; who it is of is for the envelope to say."""
     position_m, velocity_m_s = beacon.position_m, beacon.velocity_m_s
     numbers = (*(position_m or ()), *(velocity_m_s or ()))
     placed = len(numbers) == 6 and all(map(math.isfinite, numbers))
@@ -99,61 +143,55 @@ def encode_beacon(beacon: Beacon) -> bytes:
     if beacon.armed is not None:
         bits |= _ARMED if beacon.armed else _DISARMED
     accuracy_m, flown_s = beacon.gps_accuracy_m, beacon.flown_s
-    fields = (
-        (beacon.robot_id, 2, False),
-        (beacon.boot_epoch, 6, False),
-        (beacon.sequence, 4, False),
-        (beacon.sent_at_s * 1e3, 6, False),
-        *((c * 1e2, 3, True) for c in (numbers[:3] if placed else (0.0,) * 3)),
-        *((c * 1e2, 2, True) for c in (numbers[3:] if placed else (0.0,) * 3)),
-        (_STATES.index(beacon.state), 1, False),
-        (bits, 1, False),
-        (beacon.system_id or 0, 1, False),
-        (_UNKNOWN if accuracy_m is None else _ceil_cm(accuracy_m), 2, False),
-        (_UNKNOWN if flown_s is None else min(flown_s, _UNKNOWN - 1.0), 2, False),
-        (beacon.slot_height_m * 1e3, 3, True),
-        *((c * 1e3, 3, True) for c in beacon.landing_point_m),
-        (beacon.frame_id, 4, False),
-        (beacon.bundle_tag, 2, False),
-        (beacon.world_tag, 2, False),
+    values = (
+        *(numbers if placed else (0.0,) * 6),
+        _STATES.index(beacon.state),
+        bits,
+        beacon.system_id or 0,
+        _UNKNOWN if accuracy_m is None else _ceil_cm(accuracy_m),
+        _UNKNOWN if flown_s is None else min(flown_s, _UNKNOWN - 1.0),
+        beacon.slot_height_m,
+        *beacon.landing_point_m,
+        beacon.frame_id,
+        beacon.bundle_tag,
+        beacon.world_tag,
+        *(beacon.sent or _NO_TIME),
     )
-    body = _HEAD + b"".join(_packed(value, size, signed) for value, size, signed in fields)
-    return body + zlib.crc32(body).to_bytes(4, "little")
+    return _STRUCT.pack(*map(_packed, _FIELDS.values(), values))
 
 
-def decode_beacon(data: bytes | memoryview) -> Beacon:
-    """The beacon at the start of `data`. Raises MessageError."""
+def decode_beacon(data: bytes | memoryview, robot_id: int) -> Beacon:
+    """The robot's beacon at the start of `data`. Raises MessageError."""
     if len(data) < BEACON_BYTES:
         raise MessageError(f"Beacon: {len(data)} bytes: must be {BEACON_BYTES}")
-    return _decoded(bytes(data[:BEACON_BYTES]))
+    return _decoded(bytes(data[:BEACON_BYTES]), robot_id)
 
 
 # The robots of one process, as in a simulator, hear the same bytes within a moment.
 @functools.lru_cache(maxsize=8)
-def _decoded(body: bytes) -> Beacon:
-    if not body.startswith(_HEAD):
-        raise MessageError("Beacon: of another version, or none")
+def _decoded(body: bytes, robot_id: int) -> Beacon:
+    values = []
+    for (name, number), packed in zip(_FIELDS.items(), _STRUCT.unpack(body), strict=True):
+        value = packed / number.steps if number.steps > 1 else packed
+        if not number.least <= value <= number.greatest:
+            raise MessageError(
+                f"Beacon: {name} = {value}: must be from {number.least:g} to {number.greatest:g}"
+            )
+        values.append(value)
     (
-        robot_id, epoch, sequence, sent_at, place, *velocity_cm_s, state, bits, system_id,
-        accuracy_cm, flown_s, slot_height, landing_point, frame_id, bundle_tag, world_tag, checksum,
-    ) = _FIELDS.unpack(body)  # fmt: skip
-    if zlib.crc32(body[:_CRC_AT]) != checksum:
-        raise MessageError("Beacon: its checksum is wrong")
-    if state >= len(_STATES):
-        raise MessageError(f"Beacon: state {state} is not known")
-    x_m, y_m, z_m = (number / 1e2 for number in _int24s(place))
-    vx_m_s, vy_m_s, vz_m_s = (number / 1e2 for number in velocity_cm_s)
-    slot_height_m, landing_x_m, landing_y_m = (
-        number / 1e3 for number in _int24s(slot_height + landing_point)
-    )
+        x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s, state, bits, system_id, accuracy_cm, flown_s,
+        slot_height_m, landing_x_m, landing_y_m, frame_id, bundle_tag, world_tag, base, time_s,
+        uncertainty_s,
+    ) = values  # fmt: skip
     placed = bool(bits & _PLACED)
     return Beacon(
         robot_id=robot_id,
-        boot_epoch=int.from_bytes(epoch, "little"),
-        sequence=sequence,
-        sent_at_s=int.from_bytes(sent_at, "little") / 1e3,
+        sent=FleetTime(base, time_s, uncertainty_s) if base else None,
         position_m=(x_m, y_m, z_m) if placed else None,
         velocity_m_s=(vx_m_s, vy_m_s, vz_m_s) if placed else None,
+        frame_id=frame_id,
+        bundle_tag=bundle_tag,
+        world_tag=world_tag,
         state=_STATES[state],
         armed=True if bits & _ARMED else False if bits & _DISARMED else None,
         system_id=system_id or None,
@@ -161,9 +199,6 @@ def _decoded(body: bytes) -> Beacon:
         flown_s=None if flown_s == _UNKNOWN else float(flown_s),
         slot_height_m=slot_height_m,
         landing_point_m=(landing_x_m, landing_y_m),
-        frame_id=frame_id,
-        bundle_tag=bundle_tag,
-        world_tag=world_tag,
     )
 
 
@@ -172,14 +207,7 @@ def _ceil_cm(value_m: float) -> int:
     return math.ceil(min(value_m * 1e2, _UNKNOWN - 1.0) - 1e-6)
 
 
-def _packed(value: float, size: int, signed: bool) -> bytes:
-    bits = 8 * size
-    least, greatest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+def _packed(number: _Number, value: float) -> float:
     # Bounded first: not every float has an integer.
-    return round(min(max(value, least), greatest)).to_bytes(size, "little", signed=signed)
-
-
-def _int24s(data: bytes) -> list[int]:
-    return [
-        int.from_bytes(data[at : at + 3], "little", signed=True) for at in range(0, len(data), 3)
-    ]
+    bounded = min(max(value, number.least), number.greatest)
+    return bounded if number.code in "fd" else round(bounded * number.steps)

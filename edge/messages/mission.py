@@ -277,8 +277,8 @@ class LoopStatus:
 class RadioCounts:
     """Counts of messages between a robot and its neighbours since the start of its program.
 
-    `sent` is how many messages its policy had for them, `sent_bytes` what these had together,
-    without envelopes. `arrivals` is what came of each, also too late: `Arrivals.counts`, by robot.
+    `sent` is how many messages it had for them, `sent_bytes` what these had together, without
+    envelopes. `arrivals` is what came of each, also too late: `Arrivals.counts`, by robot.
     """
 
     sent: Count

@@ -2,7 +2,7 @@
 
 import math
 import platform
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -94,7 +94,6 @@ class _Flight:
         self._ticks = 0
         self._pac = Pac(
             robot_id=0,
-            boot_epoch=1,
             policy=self._policy,
             sensor=self,
             odometry=self,
@@ -142,17 +141,13 @@ class _Flight:
         for number, (offset, payload) in enumerate(
             zip(self._offsets.tolist(), self._payloads, strict=True), 1
         ):
-            message = AggregatedMessage(
+            beacon = replace(
+                self._pac.beacon(now_s),
                 robot_id=number,
-                boot_epoch=1,
-                sequence=self._ticks,
-                sent=self._pac.clock.at(now_s),
                 position_m=(x + offset[0], y + offset[1], height),
-                velocity_m_s=(0.0, 0.0, 0.0),
-                frame_id=0,
-                payload=payload,
             )
-            self._pac.receive(encode(message, self._policy.bundle_id, "float16"), now_s)
+            data = encode(AggregatedMessage(payload), "float16")
+            self._pac.receive(beacon, (1, self._ticks), data, now_s)
 
 
 def _percentiles_ms(times_s: F64) -> tuple[float, float, float]:

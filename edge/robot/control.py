@@ -9,7 +9,6 @@ from msgspec.structs import replace
 
 from edge.core.fleet_time import FleetTime
 from edge.core.logger import log
-from edge.core.mailbox import Neighbour
 from edge.core.ports import Camera, Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
@@ -29,7 +28,7 @@ from edge.flight.state import (
     height_m,
 )
 from edge.flight.step import step
-from edge.messages.beacon import Beacon, HeardBeacon
+from edge.messages.beacon import Beacon, HeardBeacon, Neighbour
 from edge.messages.codes import CheckCode, FailedCheck, Reason
 from edge.messages.mission import (
     AIRBORNE,
@@ -41,11 +40,12 @@ from edge.messages.mission import (
 )
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation
+from edge.robot.neighbours import BEACON_LASTS_S
 from edge.robot.pac import Pac
 from edge.robot.readiness import Assignment, Checks
 
 # Beacons come at the policy's rate, or a little less often without it.
-_MAX_BEACON_AGE_S = 1.5
+_KEEPS_AWAY_S = 1.5
 # Beacons that a bad radio loses make nobody look for another landing point.
 _SILENT_FOR_GOOD_S = 3.0
 # Checks that are older say nothing about now.
@@ -68,8 +68,8 @@ class GroundWorld(NamedTuple):
 class FlightControl:
     """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
 
-    Another thread sets `checks`, `peers` (the other robots' beacons), `revoked` (robots that nobody
-    listens to any more), `px4_change`, and `world` for the `wanted_world_id`, whole.
+    Another thread sets `checks`, `revoked` (robots that nobody listens to any more), `px4_change`,
+    and `world` for the `wanted_world_id`, whole.
     `obeyed_sequence` and `operator` are the last ground state's. `assignment` is what is flown by,
     `not_taken` what of the ground's state it is not. `fell_silent` is as in `FlightInputs`.
     `energy` is how long the battery lasts, and the way home takes.
@@ -109,7 +109,6 @@ class FlightControl:
         self.alarms: tuple[Reason, ...] = ()
         self.checks: Checks | None = None
         self.px4_change: Px4Change | None = None
-        self.peers: tuple[HeardBeacon, ...] = ()
         self.revoked: frozenset[int] = frozenset()
         self.fell_silent: tuple[Neighbour, ...] = ()
         # By robot id: the last that was heard of it in this frame, and when that was so.
@@ -145,8 +144,7 @@ class FlightControl:
             self._take_up(ground, vehicle)
         self._navigation.look(vehicle, now_s)
         odometry = self._navigation.estimate(vehicle)
-        # Another thread replaces them meanwhile.
-        peers = self.peers
+        peers = self._pac.table.heard(now_s, BEACON_LASTS_S)
         heard = self._neighbours(peers, now_s)
         silence = self.assignment.robot.silence
         silent = self._silent(peers, heard, silence, now_s)
@@ -364,34 +362,20 @@ class FlightControl:
         )
 
     def _neighbours(self, peers: tuple[HeardBeacon, ...], now_s: float) -> tuple[Neighbour, ...]:
-        """Robots to keep away from: also those that are silent since their policy or sensor failed.
-
-        They still tell their place in their beacons.
-        """
-        heard = self._pac.mailbox.neighbours(now_s)
-        known = {self.assignment.robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
-        told = []
-        for beacon, heard_at_s in peers:
-            age_s = now_s - heard_at_s
-            if (
-                beacon.robot_id in known
-                or beacon.frame_id != self._pac.frame_id
-                or age_s > _MAX_BEACON_AGE_S
-            ):
-                continue
-            if beacon.position_m is not None and beacon.velocity_m_s is not None:
-                told.append(
-                    Neighbour(beacon.robot_id, beacon.position_m, beacon.velocity_m_s, age_s)
-                )
-        piloted = {
-            beacon.robot_id
-            for beacon, _ in peers
-            if beacon.state is FlightState.PILOT or _is_off_height(beacon)
-        }
+        """Robots to keep away from: also those whose policies are silent."""
         return tuple(
-            # Flight has no use for their maps, and the log would hold each of them at each tick.
-            Neighbour(robot_id, place_m, velocity_m_s, age_s, trial, None, robot_id in piloted)
-            for robot_id, place_m, velocity_m_s, age_s, trial, _, _ in (*heard, *told)
+            Neighbour(
+                beacon.robot_id,
+                beacon.position_m,
+                beacon.velocity_m_s,
+                max(now_s - sent_at_s, 0.0),
+                beacon.state is FlightState.PILOT or _is_off_height(beacon),
+            )
+            for beacon, heard_at_s, sent_at_s in peers
+            if now_s - heard_at_s <= _KEEPS_AWAY_S
+            and beacon.frame_id == self._pac.frame_id
+            and beacon.position_m is not None
+            and beacon.velocity_m_s is not None
         )
 
     def _revoked_places(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
@@ -441,7 +425,7 @@ class FlightControl:
         self, peers: tuple[HeardBeacon, ...], silent: tuple[Neighbour, ...]
     ) -> Point | None:
         frame_id, robot = self._pac.frame_id, self.assignment.robot
-        for beacon, _ in peers:
+        for beacon, *_ in peers:
             if beacon.frame_id == frame_id and beacon.robot_id != robot.robot_id:
                 self._last_beacons[beacon.robot_id] = beacon
         others, parameters = self._last_beacons, robot.parameters

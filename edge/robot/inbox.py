@@ -1,4 +1,4 @@
-"""Messages that came by radio, kept for the loops: the ground's state, orders, others' beacons.
+"""Messages of the ground, kept for the loops: its state, holds, orders and world.
 
 The link's threads only put bytes in; whoever takes something out decodes it.
 """
@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 from edge.identity.card import Role
 from edge.identity.guard import Speaker
-from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import (
     HOLD_LASTS_S,
@@ -23,10 +22,10 @@ from edge.messages.mission import (
     SafetyAction,
     SafetyForm,
 )
+from edge.robot.neighbours import BEACON_LASTS_S, NeighbourTable
 
 _MOST_ORDERS = 64
 _MOST_STATES = 16
-_BEACON_LIFETIME_S = 3.0
 # The ground names whom it hears; in a large fleet it takes so long until all had their turn.
 _GROUND_NAMES_WITHIN_S = 20.0
 # Whom the ground has heard for so long a robot hears, too, unless their radios do not reach.
@@ -60,7 +59,6 @@ class Inbox:
         self._lock = Lock()
         self._grounds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
         self._orders: deque[_Arrived] = deque(maxlen=_MOST_ORDERS)
-        self._beacons: dict[int, HeardBeacon] = {}
         # When robots, by what they are called, said what is no beacon of this version.
         self._strangers: dict[str, float] = {}
         self._ground: GroundState | None = None
@@ -74,11 +72,8 @@ class Inbox:
         self.ground_refusal = ""
         # The text of the newest world file that the ground sent.
         self.world: bytes | None = None
-        # Who said lately what could not be read, as `peers` found it.
-        self.not_understood: tuple[str, ...] = ()
         self.not_understood_count = 0
         self._heard_by_ground: dict[int, _HeardByGround] = {}
-        self._beacon_at_s: dict[int, float] = {}
 
     def put_ground(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """A ground's state arrived."""
@@ -95,17 +90,6 @@ class Inbox:
     def put_order(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """An order arrived."""
         self._orders.append(_Arrived(data, speaker, now_s))
-
-    def put_beacon(self, beacon: Beacon, now_s: float) -> None:
-        """Another robot's beacon arrived."""
-        with self._lock:
-            known = self._beacons.get(beacon.robot_id)
-            late = known is not None and now_s - known.heard_at_s < _BEACON_LIFETIME_S and (
-                beacon.boot_epoch, beacon.sequence
-            ) <= (known.beacon.boot_epoch, known.beacon.sequence)  # fmt: skip
-            if not late:
-                self._beacons[beacon.robot_id] = HeardBeacon(beacon, now_s)
-                self._beacon_at_s[beacon.robot_id] = now_s
 
     def put_stranger(self, name: str, now_s: float) -> None:
         """A robot's message arrived that could not be read."""
@@ -227,23 +211,17 @@ class Inbox:
             form.expires_at_uptime_s, form.operator,
         )  # fmt: skip
 
-    def peers(self, now_s: float) -> tuple[HeardBeacon, ...]:
-        """The fresh beacons of the other robots, by robot id."""
+    def strangers(self, now_s: float) -> tuple[str, ...]:
+        """Robots that said lately what could not be read."""
         with self._lock:
-            self._beacons = {
-                robot_id: heard
-                for robot_id, heard in sorted(self._beacons.items())
-                if now_s - heard.heard_at_s <= _BEACON_LIFETIME_S
-            }
             self._strangers = {
                 name: at_s
                 for name, at_s in sorted(self._strangers.items())
-                if now_s - at_s <= _BEACON_LIFETIME_S
+                if now_s - at_s <= BEACON_LASTS_S
             }
-            self.not_understood = tuple(self._strangers)
-            return tuple(self._beacons.values())
+            return tuple(self._strangers)
 
-    def unheard(self, now_s: float) -> tuple[int, ...]:
+    def unheard(self, now_s: float, table: NeighbourTable) -> tuple[int, ...]:
         """Robots that the ground hears and this one does not."""
         with self._lock:
             return tuple(
@@ -253,8 +231,7 @@ class Inbox:
                 and f"robot {robot_id}" not in self._strangers
                 and now_s - at_s <= _GROUND_NAMES_WITHIN_S
                 # The ground heard it, and this robot did not.
-                and at_s - max(since_s, self._beacon_at_s.get(robot_id, -math.inf))
-                >= _HEARD_WITHIN_S
+                and at_s - max(since_s, table.last_heard_s(robot_id)) >= _HEARD_WITHIN_S
             )
 
 

@@ -5,7 +5,6 @@ Nothing here has a clock, a thread or a socket of its own. On a drone, threads c
 """
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Mapping
 from operator import attrgetter
@@ -15,7 +14,7 @@ from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, 
 from edge.core.vehicle import Action, VehicleState
 from edge.flight.state import flown_s, in_air
 from edge.identity.guard import Guard, Speaker
-from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon, tag
+from edge.messages.beacon import BEACON_BYTES, decode_beacon, encode_beacon, tag
 from edge.messages.bounds import MOST_TEXTS
 from edge.messages.codec import MessageError, encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
@@ -46,6 +45,7 @@ from edge.robot.config import RobotConfig
 from edge.robot.control import FlightControl, GroundWorld
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation
+from edge.robot.neighbours import BEACON_LASTS_S
 from edge.robot.pac import Pac, PolicyTick
 from edge.robot.readiness import Readiness
 
@@ -89,8 +89,7 @@ class RobotNode:
     """One robot. Each `*_step` belongs to one thread; `receive`'s callbacks to any number.
 
     It speaks and hears by its guard, and until it has a link (`attach`), nobody hears it.
-    `boot_nonce` and `boot_epoch` tell this start of its program from others; the epoch grows from
-    start to start.
+    `boot_nonce` tells this start of its program from others.
     """
 
     def __init__(
@@ -102,7 +101,6 @@ class RobotNode:
         guard: Guard,
         *,
         boot_nonce: int,
-        boot_epoch: int,
     ) -> None:
         """`world` is the text of its world file. Raises ValueError if that cannot be used."""
         clock = ports.clock
@@ -110,17 +108,15 @@ class RobotNode:
         self._ports = ports
         self._bundle_id = policy.policy.bundle_id.hex()
         self._boot_nonce = boot_nonce
-        self._boot_epoch = boot_epoch
         self._started_s = clock.monotonic_s()
         self._fed_s = -math.inf
         self._guard = guard
         self._link: Link | None = None
-        # What it knows: its place, its radio mail, its map and messages.
+        # What it knows: its place, the ground's mail, its map and its neighbours.
         self._navigation = Navigation(ports.vehicle, clock.monotonic_s, config.position)
         self._inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
         self._pac = Pac(
             robot_id=config.robot_id,
-            boot_epoch=boot_epoch,
             policy=policy.policy,
             sensor=ports.sensor_over(world, config.policy.world),
             odometry=self._navigation,
@@ -156,11 +152,10 @@ class RobotNode:
         self._told: tuple[object, ...] = ()
         self._told_at_s = -math.inf
         self._radio_counts_told_at_s = -math.inf
-        # Two threads take from it; its `next` cannot be interrupted.
-        self._message_sequence = itertools.count(1)
         self._message_at_s = -math.inf
-        # How many the policy had, and their bytes.
+        # How many messages the policy had, and their bytes; how many beacons went alone.
         self._sent = (0, 0)
+        self._sent_alone = 0
         self._told_problems: set[str] = set()
         self._explored_due_s = -math.inf
 
@@ -195,28 +190,25 @@ class RobotNode:
     def _receive_world(self, _: str, data: bytes, __: Speaker) -> None:
         self._inbox.put_world(data)
 
-    def _receive_message(self, key: str, data: bytes, _: Speaker) -> None:
-        """A robot's: to inbox and mailbox, and what came to the log."""
+    def _receive_message(self, key: str, data: bytes, speaker: Speaker) -> None:
+        """A robot's: to the table of neighbours, and what came to the log."""
         now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
         sender = int(key.split("/")[1])
+        rejection = age_s = None
         try:
-            beacon = decode_beacon(data)
+            beacon = decode_beacon(data, sender)
         except MessageError:
-            beacon = None
-        if beacon is None or beacon.robot_id != sender:
             self._inbox.put_stranger(f"robot {sender}", now_s)
         else:
-            self._inbox.put_beacon(beacon, now_s)
-        rejection = None
-        if len(data) > BEACON_BYTES:
-            rejection = self._pac.receive(data, now_s, sender=sender, start=BEACON_BYTES)
+            age_s = self._pac.age_s(beacon, now_s)
+            rejection = self._pac.receive(beacon, speaker.number, data[BEACON_BYTES:], now_s)
         self._ports.recorder.record(
             "received",
             unix_now_s,
             {
                 "sender": sender,
-                "sequence": beacon and beacon.sequence,
-                "age_s": beacon and unix_now_s - beacon.sent_at_s,
+                "sequence": speaker.number.sequence,
+                "age_s": age_s,
                 "rejection": rejection,
             },
         )
@@ -226,8 +218,6 @@ class RobotNode:
     def control_step(self) -> None:
         """Read the newest of everything, decide, send at most one setpoint; the rate of control."""
         clock = self._ports.clock
-        # Here, since preflight may wait for the vehicle for seconds.
-        self._control.peers = self._inbox.peers(clock.monotonic_s())
         self._control.revoked = self._guard.revoked_robots()
         flying = self._control.tick(clock.monotonic_s())
         self._ports.watchdog.feed(flying=flying)
@@ -268,18 +258,14 @@ class RobotNode:
     def _publish_message(self, of_policy: bytes = b"") -> None:
         """To the neighbours: a beacon, and behind it what the policy says, if it does."""
         control, vehicle = self._control, self._ports.vehicle.state()
-        odometry, now_s = self._navigation.odometry(), self._ports.clock.monotonic_s()
+        now_s = self._ports.clock.monotonic_s()
         assignment, gps = control.assignment, vehicle.gps
         parameters = assignment.robot.parameters
         x_m, y_m = parameters.landing_point_m
         self._message_at_s = now_s
-        beacon = Beacon(
-            robot_id=self._config.robot_id,
-            boot_epoch=self._boot_epoch,
-            sequence=next(self._message_sequence),
-            sent_at_s=self._ports.clock.unix_s(),
-            position_m=odometry and odometry.position_m,
-            velocity_m_s=odometry and odometry.velocity_m_s,
+        beacon = dataclasses.replace(
+            self._pac.beacon(now_s),
+            world_tag=tag(assignment.world_id),
             state=control.flight.state,
             armed=vehicle.armed,
             system_id=vehicle.system_id,
@@ -287,14 +273,13 @@ class RobotNode:
             flown_s=flown_s(control.flight, vehicle, now_s),
             slot_height_m=parameters.slot_height_m,
             landing_point_m=(x_m, y_m),
-            frame_id=self._pac.frame_id,
-            bundle_tag=tag(self._bundle_id),
-            world_tag=tag(assignment.world_id),
         )
         data = encode_beacon(beacon) + of_policy
         if of_policy:
             count, total_bytes = self._sent
             self._sent = count + 1, total_bytes + len(data)
+        else:
+            self._sent_alone += 1
         self._publish(MESSAGE, data)
 
     def try_sensor(self) -> str:
@@ -321,7 +306,6 @@ class RobotNode:
         )
         control.px4_change = self.readiness.px4_change
         now_s = self._ports.clock.monotonic_s()
-        peers = self._inbox.peers(now_s)
         # A robot's own wall clock may be wrong: there is no internet on a field.
         ground_unix_s, own_unix_s = self._inbox.ground_unix_s(now_s), self._ports.clock.unix_s()
         unix_now_s = ground_unix_s or own_unix_s
@@ -333,9 +317,9 @@ class RobotNode:
             assignment=assignment,
             position=self._navigation.position,
             odometry=self._navigation.odometry(),
-            peers=peers,
-            not_understood=self._inbox.not_understood,
-            unheard=self._inbox.unheard(now_s),
+            peers=self._pac.table.heard(now_s, BEACON_LASTS_S),
+            not_understood=self._inbox.strangers(now_s),
+            unheard=self._inbox.unheard(now_s, self._pac.table),
             fell_silent=control.fell_silent,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),
@@ -407,7 +391,7 @@ class RobotNode:
         odometry = self._navigation.odometry()
         self._statuses += 1
         ready = flight.state is FlightState.PREFLIGHT and failed_checks == ()
-        neighbours = self._pac.mailbox.neighbours(now_s)
+        neighbours = self._pac.table.neighbours(now_s)
         policy_velocity_m_s = self._pac.control(now_s)
         ground_age_s = control.ground_age_s(now_s)
         energy = control.energy
@@ -440,7 +424,10 @@ class RobotNode:
             battery=vehicle.battery,
             satellites=None if gps is None else gps.satellites,
             message_counts=self._message_counts(),
-            neighbour_ages_s={str(n.robot_id): round(n.age_s, 3) for n in neighbours},
+            neighbour_ages_s={
+                str(beacon.robot_id): round(max(now_s - sent_at_s, 0.0), 3)
+                for beacon, _, sent_at_s in neighbours
+            },
             loops=dict(loops),
             fence=robot.fence,
             not_taken=control.not_taken,
@@ -451,7 +438,7 @@ class RobotNode:
                 None if policy_velocity_m_s is None else tuple(policy_velocity_m_s.tolist())
             ),
             feature_age_s=self._pac.feature_age_s(now_s),
-            neighbour_messages={str(r): n for r, n in self._pac.mailbox.accepted().items()},
+            neighbour_messages={str(r): n for r, n in self._pac.table.accepted().items()},
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
             remote_control=(
                 bool(vehicle.remote_control) if self._config.failsafe.rc == "pilot" else None
@@ -515,13 +502,17 @@ class RobotNode:
         """Counts of all that came, from the policy's messages out to the radio's."""
         not_admitted = 0 if self._link is None else self._link.refused()
         besides = {"not_admitted": not_admitted, "not_understood": self._inbox.not_understood_count}
-        counts = self._pac.mailbox.counts() | self._guard.refused()
+        counts = self._pac.table.counts() | self._guard.refused()
         return counts | {what: count for what, count in besides.items() if count}
 
     def _radio_counts(self) -> RadioCounts:
-        sent, sent_bytes = self._sent
-        arrivals = self._pac.mailbox.arrivals().items()
-        return RadioCounts(sent, sent_bytes, {str(robot): each.counts for robot, each in arrivals})
+        (of_policy, sent_bytes), alone = self._sent, self._sent_alone
+        arrivals = self._pac.table.arrivals().items()
+        return RadioCounts(
+            of_policy + alone,
+            sent_bytes + alone * BEACON_BYTES,
+            {str(robot): each.counts for robot, each in arrivals},
+        )
 
     def _is_duplicate(self) -> bool:
         robot_id = self._config.robot_id

@@ -20,7 +20,6 @@ from edge.core import F32, F64, Bools
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetClock
 from edge.core.frames import ModelScale
-from edge.core.mailbox import Mailbox
 from edge.core.memory import RobotMemory
 from edge.core.part import PartError, array_problem, in_one_line
 from edge.core.perception import clamp_to_world, neighbours_in_range
@@ -36,7 +35,7 @@ from edge.core.wire import (
 )
 from edge.flight.safety import limit_speed
 from edge.identity.envelope import OVERHEAD_BYTES
-from edge.messages.beacon import BEACON_BYTES
+from edge.messages.beacon import BEACON_BYTES, Beacon, tag
 from edge.messages.bounds import RobotId
 from edge.policy.bundle import BundleError
 from edge.policy.family import (
@@ -47,6 +46,7 @@ from edge.policy.family import (
     perceived_problem,
     step_problem,
 )
+from edge.robot.neighbours import NeighbourTable, Number, ReceivedMessage
 
 _Array = TypeVar("_Array", F32, F64)
 Position = tuple[float, float, float]  # in the mission frame, m
@@ -54,7 +54,7 @@ Position = tuple[float, float, float]  # in the mission frame, m
 
 @dataclass(frozen=True, slots=True)
 class PacParameters(Bounded):
-    """The fleet's settings of the loop; ages in s, see `Mailbox` for `max_message_age_s`.
+    """The fleet's settings of the loop; ages in s, see `NeighbourTable` for `max_message_age_s`.
 
     Features, and then an action, that are older than `max_input_age_s` are not used: two ticks of
     the policy may be missed, then the robot stops.
@@ -81,8 +81,8 @@ def message_bytes(policy: Policy, payload: PayloadType) -> tuple[int, int]:
 
 # The robots of one process, as in a simulator, hear the same bytes within a moment.
 @functools.lru_cache(maxsize=8)
-def _decode(data: bytes, start: int, **own: Any) -> AggregatedMessage | Rejection:
-    return decode(memoryview(data)[start:], **own)
+def _decode(data: bytes, **own: Any) -> AggregatedMessage | Rejection:
+    return decode(data, **own)
 
 
 class _Timed(NamedTuple, Generic[_Array]):
@@ -104,7 +104,7 @@ class PolicyTick:
     """Record of one `Pac.infer`.
 
     From `features` and the `payloads` of `senders`, for a node of `degree` neighbours, came
-    `velocity` (2,), in model units, and `message`, the bytes for the neighbours.
+    `velocity` (2,), in model units, and `message`, the bytes for the neighbours behind a beacon.
     """
 
     features: F32
@@ -126,7 +126,6 @@ class Pac:
         self,
         *,
         robot_id: int,
-        boot_epoch: int,
         policy: Policy,
         sensor: Sensor | Camera,
         odometry: OdometrySource,
@@ -140,14 +139,13 @@ class Pac:
                 f"bundle {manifest.name!r} has no perception: it cannot drive a robot"
             )
         self._robot_id = robot_id
-        self._boot_epoch = boot_epoch
+        self._bundle_tag = tag(policy.bundle_id.hex())
         self._policy = policy
         self._odometry = odometry
         self._parameters = parameters
         self._perception = manifest.perception
         self._decode = functools.partial(
             _decode,
-            bundle_id=policy.bundle_id,
             message_size=policy.message_size,
             payload_limit=manifest.payload_limit,
             shared_side=manifest.perception.shared_map_side,
@@ -161,12 +159,11 @@ class Pac:
         self._trial = self._map_trial = 0
         # Replaced as a whole, before the features, so that no message is sent without a map.
         self._told = _Told(0, None)
-        self._sequence = 0
         self._features: _Timed[F32] | None = None
         # The velocity (2,) that `control` gives.
         self._action: _Timed[F64] | None = None
         self.clock = FleetClock()
-        self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
+        self.table = NeighbourTable(robot_id, parameters.max_message_age_s)
         self._sensor_problem = self._observe_problem = self._step_problem = ""
         # Replaced whole when the ground sets another origin or another world, which it does while
         # nobody flies.
@@ -182,24 +179,42 @@ class Pac:
         self._forget_map = True
         self._reset_agent = True
         self._features = None
-        self.mailbox.clear()
+        self.table.clear()
+
+    def beacon(self, now_s: float) -> Beacon:
+        """What precedes a message that is sent now, as far as it is known here."""
+        odometry = self._finite_odometry()
+        return Beacon(
+            robot_id=self._robot_id,
+            sent=self.clock.at(now_s),
+            position_m=odometry and odometry.position_m,
+            velocity_m_s=odometry and odometry.velocity_m_s,
+            frame_id=self.frame_id,
+            bundle_tag=self._bundle_tag,
+        )
 
     def receive(
-        self, data: bytes, now_s: float, *, sender: int | None = None, start: int = 0
+        self, beacon: Beacon, number: Number, data: bytes, now_s: float
     ) -> Rejection | None:
-        """Put a neighbour's message into the mailbox; returns, and counts, why it was not.
+        """Take in what another robot says; returns, and counts, why its policy is not listened to.
 
-        It is what is in `data` from `start` on. `sender` is the robot that it came from, for
-        whoever knows: no other's is taken then.
+        `data` is what is behind the beacon, nothing if its policy is silent.
         """
-        message = self._decode(data, start, frame_id=self.frame_id)
-        if not isinstance(message, Rejection) and sender not in (None, message.robot_id):
-            message = Rejection.OTHER_SENDER
-        if isinstance(message, Rejection):
-            self.mailbox.reject(message)
-            return message
-        age = None if message.sent is None else self.clock.age_s(message.sent, now_s)
-        return self.mailbox.receive(message, now_s, None if age is None else age.most_s)
+        message: AggregatedMessage | Rejection | None
+        if not data:
+            message = None
+        elif beacon.bundle_tag != self._bundle_tag:
+            message = Rejection.OTHER_BUNDLE
+        elif beacon.frame_id != self.frame_id or beacon.position_m is None:
+            message = Rejection.OTHER_FRAME
+        else:
+            message = self._decode(data)
+        return self.table.receive(beacon, number, message, now_s, self.age_s(beacon, now_s))
+
+    def age_s(self, beacon: Beacon, now_s: float) -> float | None:
+        """How old a beacon is at most; None if that is not known."""
+        age = None if beacon.sent is None else self.clock.age_s(beacon.sent, now_s)
+        return None if age is None else age.most_s
 
     def perceive(self, now_s: float) -> Perceived | None:
         """Sensor view -> robot map -> features, as the policy makes them.
@@ -220,13 +235,13 @@ class Pac:
             return None
         view, seen = looked
         self._memory.observe(own, view, seen)
-        neighbours = self.mailbox.neighbours(now_s)
-        heard = self._to_model([neighbour.position_m for neighbour in neighbours])
+        neighbours = self.table.neighbours(now_s)
+        heard = self._to_model([_position_m(each) for each in neighbours])
         near = neighbours_in_range(own, heard, self._perception.communication_range)
         trial = self._map_trial
-        for neighbour, is_near in zip(neighbours, near, strict=True):
-            if is_near and neighbour.shared is not None and neighbour.trial == trial:
-                self._memory.hear(neighbour.shared)
+        for (_, message, _), is_near in zip(neighbours, near, strict=True):
+            if is_near and message.shared is not None and message.trial == trial:
+                self._memory.hear(message.shared)
         self._told = _Told(trial, self._memory.tell(own))
         # Outside the world the policy is told the nearest point of it, where training kept the
         # robots: it never sees an input that it could not have been trained on.
@@ -257,43 +272,28 @@ class Pac:
         if features is None or odometry is None or self._is_old(features, now_s):
             return None
         (own,) = self._to_model([odometry.position_m])
-        # Before the swap, which may clear the mailbox: the neighbours are more than the messages.
-        heard = [n.position_m for n in self.mailbox.neighbours(now_s)]
-        messages = self.mailbox.swap(now_s)
-        near = self._in_range(own, [*(message.position_m for message in messages), *heard])
-        near, heard_near = near[: len(messages)], near[len(messages) :]
+        # Before the swap, which may take messages away: the neighbours are more than these.
+        heard = self.table.neighbours(now_s)
+        received = self.table.swap(now_s)
+        near = self._in_range(own, [_position_m(each) for each in (*received, *heard)])
+        near, heard_near = near[: len(received)], near[len(received) :]
         degree = max(int(heard_near.sum()), int(near.sum()))
-        heeded = [message for message, is_near in zip(messages, near, strict=True) if is_near]
-        payloads = tuple(message.payload for message in heeded)
+        heeded = [each for each, is_near in zip(received, near, strict=True) if is_near]
+        payloads = tuple(each.message.payload for each in heeded)
         step = self._step(features.value, payloads, degree)
         if step is None:
             return None
         velocity, payload = step
         velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(velocity.astype(np.float64))
         self._action = _Timed(limit_speed(velocity_m_s, self._parameters.max_speed_m_s), now_s)
-        self._sequence += 1
-        told = self._told
-        message = AggregatedMessage(
-            robot_id=self._robot_id,
-            boot_epoch=self._boot_epoch,
-            sequence=self._sequence,
-            sent=self.clock.at(now_s),
-            position_m=odometry.position_m,
-            velocity_m_s=odometry.velocity_m_s,
-            frame_id=self.frame_id,
-            payload=payload,
-            trial=told.trial,
-            shared=told.shared,
-        )
+        message = AggregatedMessage(payload, *self._told)
         return PolicyTick(
             features=features.value,
-            senders=tuple(message.robot_id for message in heeded),
+            senders=tuple(each.beacon.robot_id for each in heeded),
             payloads=payloads,
             degree=degree,
             velocity=velocity,
-            message=encode(
-                message, self._policy.bundle_id, self._parameters.payload, as_in_flight=on_ground
-            ),
+            message=encode(message, self._parameters.payload, as_in_flight=on_ground),
         )
 
     def control(self, now_s: float) -> F64 | None:
@@ -406,3 +406,9 @@ class Pac:
 
     def _is_old(self, timed: _Timed[Any], now_s: float) -> bool:
         return now_s - timed.time_s > self._parameters.max_input_age_s
+
+
+def _position_m(received: ReceivedMessage) -> Position:
+    position_m = received.beacon.position_m
+    assert position_m is not None  # Or it would not have been taken.
+    return position_m

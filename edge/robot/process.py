@@ -138,7 +138,6 @@ def run(config: RobotConfig, stop: Stop) -> None:
             world,
             signed or Unguarded(int(1e3 * clock.unix_s())),
             boot_nonce=boot_nonce,
-            boot_epoch=int(clock.unix_s() * 1e3),
         )
         # 6. The radio that feeds it, and takes what it says.
         link = parts.enter_context(_open_link(config, node, config.robot_id, identity, signed))
@@ -412,7 +411,6 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             world,
             Unguarded(0) if identity is None else identity.guard(clock.monotonic_s),
             boot_nonce=0,
-            boot_epoch=0,
         )
         # Not as the robot itself: its program is not running.
         node.attach(parts.enter_context(_open_link(config, node, None, identity, None)))

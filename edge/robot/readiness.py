@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 from edge.core.fence import Fence
 from edge.core.logger import log
-from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry, Vehicle, VehicleSetup
 from edge.core.position import PositionJudgement
 from edge.core.vehicle import GPS_CONTROL
@@ -19,7 +18,7 @@ from edge.flight.failsafe import check as check_parameters
 from edge.flight.preflight import PreflightInputs, failed_checks
 from edge.flight.state import Px4Change, Robot
 from edge.identity.guard import CardProblem
-from edge.messages.beacon import HeardBeacon
+from edge.messages.beacon import HeardBeacon, Neighbour
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 from edge.robot.config import RobotConfig

@@ -5,31 +5,23 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from edge.core import F32, F64, Bools
-from edge.core.mailbox import Mailbox
 from edge.core.part import PartError
 from edge.core.ports import OdometrySource
-from edge.core.wire import Rejection
 from edge.drivers.world_sensor import WorldSensor
+from edge.messages.beacon import Beacon
 from edge.policy.bundle import BundleError
 from edge.policy.family import Policy
-from edge.robot.pac import Pac, PacParameters, PolicyTick
+from edge.robot.neighbours import NeighbourTable, Number
+from edge.robot.pac import Pac, PacParameters
 from lpac.sim.failure import Failure
 from lpac.sim.medium import Medium
 from lpac.sim.ticks import Clocks, ticks
 from lpac.sim.vehicles import PointVehicles, VehicleOdometry
-
-
-class Saying(Protocol):
-    """Result of a robot's policy."""
-
-    @property
-    def message(self) -> Any:
-        """Message to its neighbours."""
 
 
 class SwarmRobot(Protocol):
@@ -38,15 +30,18 @@ class SwarmRobot(Protocol):
     largest_payload: float
 
     @property
-    def mailbox(self) -> Mailbox: ...
+    def table(self) -> NeighbourTable: ...
     @property
     def waits(self) -> bool:
         """Whether `control` needs something that somebody else has still to compute."""
 
     def perceive(self, now_s: float) -> object: ...
-    def infer(self, now_s: float) -> Saying | None: ...
     def control(self, now_s: float) -> F64 | None: ...
-    def receive(self, message: Any, now_s: float) -> object: ...
+    def say(self, now_s: float) -> Any:
+        """Decide; its message to its neighbours, None if it has none."""
+
+    def hear(self, message: Any, now_s: float) -> None:
+        """Take in another's message."""
 
 
 _Robot = TypeVar("_Robot", bound=SwarmRobot)
@@ -66,7 +61,7 @@ class Swarm(Generic[_Robot]):
         failures: Sequence[Failure] = (),
         bias_m: F64 | None = None,
     ) -> None:
-        """`boot` makes a robot of its number, boot epoch and odometry, at each of its starts.
+        """`boot` makes a robot of its number, start, from 1 on, and odometry, at each start.
 
         `rng` draws the clocks' phases; `bias_m` (N, 2) is by how much the robots' knowledge of
         their positions is wrong.
@@ -143,7 +138,7 @@ class Swarm(Generic[_Robot]):
         """(N, N), [receiver, sender]: whose message a robot has that is fresh; takes none away."""
         heard = np.zeros((len(self.robots),) * 2, np.bool_)
         for receiver, robot in enumerate(self.robots):
-            heard[receiver, [near.robot_id for near in robot.mailbox.neighbours(now_s)]] = True
+            heard[receiver, [near.beacon.robot_id for near in robot.table.neighbours(now_s)]] = True
         return heard & self.alive[:, None]
 
     @property
@@ -162,7 +157,7 @@ class Swarm(Generic[_Robot]):
         """Broadcasts, and what became of them at each receiver in range, in all."""
         counts = Counter({"broadcasts": self._medium.broadcasts, "lost": self._medium.lost})
         for robot in (*self.robots, *self._gone):
-            counts.update(robot.mailbox.counts())
+            counts.update(robot.table.counts())
         return dict(counts)
 
     def _booted(self, robot: int) -> _Robot:
@@ -177,15 +172,15 @@ class Swarm(Generic[_Robot]):
 
     def _infer(self, robot: int) -> None:
         now_s = self._vehicles.now_s
-        said = self.robots[robot].infer(now_s)
-        if said is None:
+        message = self.robots[robot].say(now_s)
+        if message is None:
             return
         for receiver, travel_s in self._medium.broadcast(robot, self._vehicles.positions_m()):
-            self._schedule(now_s + travel_s, partial(self._deliver, receiver, said.message))
+            self._schedule(now_s + travel_s, partial(self._deliver, receiver, message))
 
     def _deliver(self, receiver: int, message: Any) -> None:
         if receiver not in self._failed:
-            self.robots[receiver].receive(message, self._vehicles.now_s)
+            self.robots[receiver].hear(message, self._vehicles.now_s)
 
     def _fail(self, robot: int) -> None:
         self._failed.add(robot)
@@ -197,30 +192,43 @@ class Swarm(Generic[_Robot]):
         self.robots[robot] = self._booted(robot)
 
 
+class _Message(NamedTuple):
+    beacon: Beacon
+    number: Number
+    data: bytes
+
+
 class ClockedPac(Pac):
     """A robot of a fleet that has one clock."""
 
     waits = False
     largest_payload = 0.0
 
-    def infer(self, now_s: float, *, on_ground: bool = False) -> PolicyTick | None:
-        """See `Pac.infer`. Raises PartError for whatever policy and sensor do wrong."""
+    def __init__(self, *, start: int, **pac: Any) -> None:
+        """`start` tells this start of its program from others; the rest is as `Pac` has it."""
+        super().__init__(**pac)
+        self._start = start
+        self._said = 0
+
+    def say(self, now_s: float) -> _Message | None:
+        """See `SwarmRobot`. Raises PartError for whatever policy and sensor do wrong."""
         self._tell_time(now_s)
-        tick = super().infer(now_s, on_ground=on_ground)
+        tick = self.infer(now_s)
         if self.problem:
             raise PartError(f"robot {self._robot_id}: {self.problem}")
-        for payload in tick.payloads if tick else ():
+        if tick is None:
+            return None
+        for payload in tick.payloads:
             self.largest_payload = max(
                 self.largest_payload, float(np.abs(payload).max(initial=0.0))
             )
-        return tick
+        self._said += 1
+        return _Message(self.beacon(now_s), (self._start, self._said), tick.message)
 
-    def receive(
-        self, data: bytes, now_s: float, *, sender: int | None = None, start: int = 0
-    ) -> Rejection | None:
-        """See `Pac.receive`."""
+    def hear(self, message: _Message, now_s: float) -> None:
+        """See `SwarmRobot`."""
         self._tell_time(now_s)
-        return super().receive(data, now_s, sender=sender, start=start)
+        self.receive(*message, now_s)
 
     def _tell_time(self, now_s: float) -> None:
         self.clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)
@@ -249,10 +257,10 @@ def pac_swarm(
         raise BundleError(f"bundle {policy.manifest.name!r} has no perception to simulate")
     sensor = WorldSensor(importance, perception.sensor_size)
 
-    def boot(robot: int, boot_epoch: int, odometry: OdometrySource) -> ClockedPac:
+    def boot(robot: int, start: int, odometry: OdometrySource) -> ClockedPac:
         return ClockedPac(
+            start=start,
             robot_id=robot,
-            boot_epoch=boot_epoch,
             policy=policy,
             sensor=sensor,
             odometry=odometry,

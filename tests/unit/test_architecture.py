@@ -129,7 +129,7 @@ PURE = (
     "edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.robot", "lpac.radio",
 )  # fmt: skip
 BUT = {
-    "edge/core/mailbox.py": {"threading"},
+    "edge/robot/neighbours.py": {"threading"},
     "edge/core/toml.py": {"pathlib"},
     "edge/robot/inbox.py": {"threading"},
     "edge/identity/guard.py": {"threading"},

@@ -102,7 +102,7 @@ def _infer(
     hops.diffuse(payloads, degree)
     [velocity] = policy.velocity(features[None], hops)
     now = dataclasses.replace(sent, payload=hops.message(degree))
-    again = _decoded(policy, encode(now, policy.bundle_id, payload_type_of(message["message"])))
+    again = _decoded(policy, encode(now, payload_type_of(message["message"])))
     return (logged, velocity), (sent.payload, again.payload)
 
 
@@ -117,8 +117,6 @@ def _decoded(policy: LpacPolicy, data: bytes) -> AggregatedMessage:
     perception = policy.manifest.perception
     message = decode(
         data,
-        bundle_id=policy.bundle_id,
-        frame_id=None,
         message_size=policy.geometry.message_size,
         shared_side=perception.shared_map_side if perception else 0,
     )

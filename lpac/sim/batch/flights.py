@@ -134,17 +134,17 @@ class BatchedFlights:
         local_map: F32,
         first_agent: int,
         robot: int,
-        boot_epoch: int,
+        start: int,
         odometry: OdometrySource,
     ) -> BatchedRobot:
         agent = first_agent + robot
-        if boot_epoch > 1:
+        if start > 1:
             # What its agent has still to decide, it decides as the one that it was.
             self._deferred.compute()
             self._deferred.agents.reset(agent)
         return BatchedRobot(
             robot_id=robot,
-            boot_epoch=boot_epoch,
+            start=start,
             agent=agent,
             deferred=self._deferred,
             world=world,

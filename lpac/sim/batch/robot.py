@@ -15,13 +15,14 @@ import numpy as np
 from edge.core import F32, F64, Bools
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetClock, FleetTime
-from edge.core.mailbox import Mailbox, Neighbour
 from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Odometry, OdometrySource
 from edge.core.shared_map import SharedMap
 from edge.core.wire import PayloadType, rounded
 from edge.flight.safety import limit_speed
+from edge.messages.beacon import Beacon
 from edge.policy.family import Observation
+from edge.robot.neighbours import NeighbourTable, Number
 from edge.robot.pac import PacParameters
 from lpac.sim.batch.agents import Agents, Inputs, PolicyFailedError
 from lpac.sim.batch.seen import SeenMap, ShownWorld
@@ -129,12 +130,14 @@ class DeferredSteps:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class _Message(AggregatedMessage):
+class _Deferred(AggregatedMessage):
     step: DeferredStep
 
 
-class _Said(NamedTuple):
-    message: _Message
+class _Message(NamedTuple):
+    beacon: Beacon
+    number: Number
+    message: _Deferred
 
 
 class _Look(NamedTuple):
@@ -157,7 +160,7 @@ class BatchedRobot:
         self,
         *,
         robot_id: int,
-        boot_epoch: int,
+        start: int,
         agent: int,
         deferred: DeferredSteps,
         world: ShownWorld,
@@ -171,7 +174,7 @@ class BatchedRobot:
         """
         self.agent = agent
         self._robot_id = robot_id
-        self._boot_epoch = boot_epoch
+        self._start = start
         self._deferred = deferred
         self._perception = world.parameters
         self._odometry = odometry
@@ -186,9 +189,9 @@ class BatchedRobot:
         self._action_s = 0.0
         # The last action that was flown, and its velocity in the mission frame.
         self._flown: tuple[DeferredStep, F64] | None = None
-        self._sequence = 0
+        self._said = 0
         self.largest_payload = 0.0
-        self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
+        self.table = NeighbourTable(robot_id, parameters.max_message_age_s)
 
     @property
     def waits(self) -> bool:
@@ -204,11 +207,12 @@ class BatchedRobot:
         """See, and remember who is there."""
         odometry, own = self._own()
         self._seen.observe(own)
-        heard = self.mailbox.neighbours(now_s)
+        neighbours = self.table.neighbours(now_s)
+        heard = [each.beacon for each in neighbours]
         near = self._in_range(own, heard)
-        for neighbour, is_near in zip(heard, near, strict=True):
-            if is_near and neighbour.shared is not None:
-                self._seen.hear(neighbour.shared)
+        for (_, message, _), is_near in zip(neighbours, near, strict=True):
+            if is_near and message.shared is not None:
+                self._seen.hear(message.shared)
         velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)
         velocity = self._parameters.scale.velocity_to_model(velocity_m_s)
         self._look = _Look(now_s, own, self._to_model(heard)[near], velocity, self._seen.tell(own))
@@ -219,7 +223,7 @@ class BatchedRobot:
         look = self._fresh_look(now_s)
         return None if look is None else self._inputs(look)
 
-    def infer(self, now_s: float) -> _Said | None:
+    def say(self, now_s: float) -> _Message | None:
         """Leave a step of the policy to be computed, and say the message that it leads to.
 
         None when there is nothing to send: nothing perceived that is fresh.
@@ -232,16 +236,16 @@ class BatchedRobot:
             self._deferred.add_features(self._features)
         odometry, own = self._own()
         # Where the swap takes nothing away, the neighbours are those whose messages it hands out.
-        heard = self.mailbox.neighbours(now_s) if self._swap_clears else ()
-        messages = self.mailbox.swap(now_s)
-        near = self._in_range(own, messages)
+        heard = self.table.neighbours(now_s) if self._swap_clears else ()
+        received = self.table.swap(now_s)
+        near = self._in_range(own, [each.beacon for each in received])
         degree = int(near.sum())
         if heard:
-            degree = max(int(self._in_range(own, heard).sum()), degree)
+            degree = max(int(self._in_range(own, [each.beacon for each in heard]).sum()), degree)
         heeded = tuple(
             message.step
-            for message, is_near in zip(messages, near.tolist(), strict=True)
-            if is_near and isinstance(message, _Message)
+            for (_, message, _), is_near in zip(received, near.tolist(), strict=True)
+            if is_near and isinstance(message, _Deferred)
         )
         before = (*heeded, self._action) if self._action else heeded
         step = DeferredStep(
@@ -254,20 +258,17 @@ class BatchedRobot:
         )
         self._deferred.add(step)
         self._action, self._action_s = step, now_s
-        self._sequence += 1
-        message = _Message(
+        self._said += 1
+        beacon = Beacon(
             robot_id=self._robot_id,
-            boot_epoch=self._boot_epoch,
-            sequence=self._sequence,
             sent=FleetTime(0, now_s, 0.0),
             position_m=odometry.position_m,
             velocity_m_s=odometry.velocity_m_s,
             frame_id=0,
-            payload=step.payload,
-            shared=look.shared,
-            step=step,
+            bundle_tag=0,
         )
-        return _Said(message)
+        message = _Deferred(payload=step.payload, shared=look.shared, step=step)
+        return _Message(beacon, (self._start, self._said), message)
 
     def control(self, now_s: float) -> F64 | None:
         """The velocity (2,) in the mission frame, m/s; None when there is no fresh action."""
@@ -282,10 +283,11 @@ class BatchedRobot:
             self._flown = action, limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
         return self._flown[1]
 
-    def receive(self, message: _Message, now_s: float) -> None:
-        """Put a neighbour's message into the mailbox."""
-        assert message.sent is not None
-        self.mailbox.receive(message, now_s, now_s - message.sent.time_s + _AGE_ERROR_S)
+    def hear(self, message: _Message, now_s: float) -> None:
+        """Take in a neighbour's message."""
+        sent = message.beacon.sent
+        assert sent is not None
+        self.table.receive(*message, now_s, now_s - sent.time_s + _AGE_ERROR_S)
 
     def note_payloads(self, heeded: tuple[DeferredStep, ...]) -> None:
         """Those whose payloads its policy took."""
@@ -307,12 +309,14 @@ class BatchedRobot:
         assert odometry is not None
         return odometry, self._to_model([odometry])[0]
 
-    def _in_range(self, own: F64, others: Sequence[Neighbour | AggregatedMessage]) -> Bools:
+    def _in_range(self, own: F64, others: Sequence[Beacon]) -> Bools:
         return neighbours_in_range(
             own, self._to_model(others), self._perception.communication_range
         )
 
-    def _to_model(self, known: Sequence[Odometry | Neighbour | AggregatedMessage]) -> F64:
+    def _to_model(self, known: Sequence[Odometry | Beacon]) -> F64:
         """Horizontal positions (n, 2) in model units."""
-        horizontal = np.array([each.position_m[:2] for each in known], np.float64).reshape(-1, 2)
+        horizontal = np.array(
+            [each.position_m[:2] for each in known if each.position_m], np.float64
+        ).reshape(-1, 2)
         return self._parameters.scale.position_to_model(horizontal)

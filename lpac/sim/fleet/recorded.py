@@ -73,8 +73,6 @@ def recorded_steps(folder: Path, robot_id: int, policy: Policy) -> RecordedSteps
         for _, unix_time_s, message in read(log, "policy"):
             sent = decode(
                 message["message"],
-                bundle_id=policy.bundle_id,
-                frame_id=None,
                 message_size=policy.message_size,
                 shared_side=perception.shared_map_side if perception else 0,
             )

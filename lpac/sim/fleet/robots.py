@@ -122,7 +122,6 @@ class SimulatedRobot:
             self.world,
             self._new_guard(self, boot),
             boot_nonce=boot,
-            boot_epoch=int(self.clock.unix_s() * 1e3) + boot,
         )
         self._link = self._open_link(self, node.subscriptions)
         node.attach(self._link)

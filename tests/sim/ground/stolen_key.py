@@ -105,15 +105,10 @@ class Thief:
         self._link = guard.over(link)
         clock.every(1.0 / _LIES_HZ, self._speak)
 
-    def _hear(self, _: str, data: bytes, __: Speaker) -> None:
-        beacon = decode_beacon(data)
-        message = decode(
-            data[BEACON_BYTES:],
-            bundle_id=self._policy.bundle_id,
-            frame_id=None,
-            message_size=self._policy.message_size,
-        )
-        if isinstance(message, Rejection) or message.robot_id == self._robot_id:
+    def _hear(self, key: str, data: bytes, __: Speaker) -> None:
+        beacon = decode_beacon(data, int(key.split("/")[1]))
+        message = decode(data[BEACON_BYTES:], message_size=self._policy.message_size)
+        if isinstance(message, Rejection):
             self._heard[beacon.robot_id] = beacon, None
         else:
             self._heard[beacon.robot_id] = beacon, message
@@ -137,8 +132,6 @@ class Thief:
         told = replace(
             beacon,
             robot_id=self._robot_id,
-            boot_epoch=beacon.boot_epoch + _START,
-            sequence=self._said,
             position_m=place_m,
             state=FlightState.TAKEOFF if self._lie is Lie.TAKES_OFF else beacon.state,
             system_id=None,
@@ -146,15 +139,8 @@ class Thief:
         data = encode_beacon(told)
         if message is not None:
             lies = self._lie in (Lie.PAYLOAD, Lie.BOTH)
-            said = replace(
-                message,
-                robot_id=self._robot_id,
-                boot_epoch=told.boot_epoch,
-                sequence=self._said,
-                position_m=place_m,
-                payload=self._payload if lies else message.payload,
-            )
-            data += encode(said, self._policy.bundle_id, "float16")
+            said = replace(message, payload=self._payload if lies else message.payload)
+            data += encode(said, "float16")
         self._link.publish(MESSAGE, data)
 
 

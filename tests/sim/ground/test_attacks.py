@@ -134,7 +134,7 @@ def test_no_packet_of_a_thief_mutes_a_robot_for_good(ahead_s: float) -> None:
     assert field.fleet.members is not None
     start = min(int(1e3 * (field.fleet.schedule.unix_s() + ahead_s)), 2**48 - 1)
     thief = field.fleet.members.guard(Role.ROBOT, "r1", 1, start, lambda: 0.0)
-    thief._sequence = 2**32 - 3
+    thief._sequences.update({"robot/1/message": 2**32 - 2, "robot/1/status": 2**32 - 2})
     link, hears = field.fleet.radio.link(1, {}), field.robots[0]
     for topic in (MESSAGE, STATUS):
         link.publish(topic, thief.seal(topic, b"stolen"))

@@ -13,7 +13,6 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F32
 from edge.core.fence import Fence
-from edge.core.mailbox import Neighbour
 from edge.core.position import PositionQuality
 from edge.core.vehicle import (
     Action,
@@ -34,7 +33,7 @@ from edge.drivers.world_sensor import WorldSensor
 from edge.flight.state import FlightInputs
 from edge.identity.card import Role
 from edge.identity.guard import Speaker
-from edge.messages.beacon import Beacon, HeardBeacon
+from edge.messages.beacon import Beacon, Neighbour
 from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, RefusalCode
 from edge.messages.mission import (
@@ -53,6 +52,7 @@ from edge.robot.config import load_config
 from edge.robot.control import FlightControl, GroundWorld
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation
+from edge.robot.neighbours import NeighbourTable
 from edge.robot.pac import Pac
 from edge.robot.readiness import Checks
 from lpac.sim.px4.link import Px4Link
@@ -167,7 +167,7 @@ class Flown:
         self.navigation = Navigation(self.autopilot, lambda: self.now_s, config.position)
         self.inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
         self.pac = Pac(
-            robot_id=config.robot_id, boot_epoch=1, policy=policy, sensor=WorldSensor(WORLD, 64),
+            robot_id=config.robot_id, policy=policy, sensor=WorldSensor(WORLD, 64),
             odometry=self.navigation, parameters=config.pac(FLOAT_PAYLOADS),
         )  # fmt: skip
         self.control = FlightControl(
@@ -270,8 +270,9 @@ class Flown:
 
     def peers(self, *beacons: Beacon, age_s: float = 0.1) -> None:
         """What other robots said of themselves."""
-        at_s = self.now_s - age_s
-        self.control.peers = tuple(HeardBeacon(beacon, at_s) for beacon in beacons)
+        self.pac.table = NeighbourTable(3)
+        for beacon in beacons:
+            self.pac.table.receive(beacon, (1, 1), None, self.now_s - age_s, None)
 
     def inputs(self) -> FlightInputs:
         """Inputs of the last tick."""

@@ -104,15 +104,16 @@ def test_what_it_publishes_and_logs_in_ten_seconds_of_flight() -> None:
     assert 0.0 < logged["received"]["age_s"] < 0.1
     assert said.remote_control is None, "there is none to lose"
     # Its neighbour hears the same.
-    (beacon,) = (heard.beacon for heard in other._inbox.peers(field.now_s))
+    (beacon,) = (heard.beacon for heard in other._pac.table.heard(field.now_s, 1.0))
     assert (beacon.state, beacon.armed, beacon.system_id) == (said.state, True, said.system_id)
     assert beacon.gps_accuracy_m == pytest.approx(said.gps_accuracy_m, abs=0.01)
     assert beacon.flown_s == pytest.approx(said.flown_s, abs=1.0)
-    # Neither beacon nor map is taken from somebody else than it names.
-    other.subscriptions[MESSAGE]("robot/5/message", node._guard.seal(MESSAGE, last["message"]))
-    other.control_step()
-    assert other._inbox.not_understood == ("robot 5",)
-    assert other.status_step({}).message_counts["other_sender"] == 1
+    # Whose it is its key tells; what is no beacon is a stranger's.
+    for robot_id, data in ((5, last["message"]), (6, b"?")):
+        sealed = node._guard.seal(MESSAGE, data)
+        other.subscriptions[MESSAGE](f"robot/{robot_id}/message", sealed)
+    assert [h.beacon.robot_id for h in other._pac.table.heard(field.now_s, 1.0)] == [0, 5]
+    assert other._inbox.strangers(field.now_s) == ("robot 6",)
     # What is new is said at once, and once.
     published.clear()
     node.identity_problem = "no room"

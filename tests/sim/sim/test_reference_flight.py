@@ -52,10 +52,10 @@ def flown_in_the_library(scenario: Scenario) -> F64:
     )
     policy = load_policy(prepared.bundle)
 
-    def boot(robot: int, boot_epoch: int, odometry: OdometrySource) -> ClockedPac:
+    def boot(robot: int, start: int, odometry: OdometrySource) -> ClockedPac:
         return ClockedPac(
+            start=start,
             robot_id=robot,
-            boot_epoch=boot_epoch,
             policy=policy,
             sensor=LibrarySensor(environment, robot),
             odometry=odometry,

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from edge.core import F64
-from edge.core.mailbox import Neighbour
 from edge.core.part import PartError
 from edge.drivers.flight_log import read
 from edge.flight.failsafe import required
@@ -754,9 +753,7 @@ def test_what_the_robots_logged_is_what_they_computed(logged: Logged) -> None:
         for topic, unix_time_s, message in messages:
             if topic == "flight":
                 flight.run(unix_time_s, message)
-                heard = message["given"].get("inputs", {}).get("neighbours", ())
-                assert all(Neighbour(*told).shared is None for told in heard), "maps fill the disk"
-                neighbours += len(heard)
+                neighbours += len(message["given"].get("inputs", {}).get("neighbours", ()))
         ticks = sum(topic == "control" for topic, _, _ in messages)
         assert (flight.ticks, flight.passed_over, flight.differing) == (ticks, 0, 0)
     assert neighbours > 0

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetClock
-from edge.core.mailbox import Mailbox
+from edge.messages.beacon import Beacon
+from edge.robot.neighbours import NeighbourTable
 
 MAX_AGE_S = 0.8
 GROUND = 7
@@ -59,8 +60,8 @@ def test_no_place_that_is_older_than_allowed_is_fresh(
     messages: list[tuple[float, float]],
 ) -> None:
     clock_of = dict(zip((SENDER, RECEIVER), own, strict=True))
-    knows, mailbox = {robot: FleetClock() for robot in clock_of}, Mailbox(RECEIVER, MAX_AGE_S)
-    sent: dict[int, AggregatedMessage] = {}
+    knows, table = {robot: FleetClock() for robot in clock_of}, NeighbourTable(RECEIVER, MAX_AGE_S)
+    sent: dict[int, Beacon] = {}
 
     def echo(trip: Trip) -> None:
         clock = clock_of[trip.robot]
@@ -75,15 +76,16 @@ def test_no_place_that_is_older_than_allowed_is_fresh(
     def send(sequence: int, true_s: float) -> None:
         when = knows[SENDER].at(clock_of[SENDER].at(true_s))
         # Where it was is when it was.
-        sent[sequence] = AggregatedMessage(
-            SENDER, 1, sequence, when, (true_s, 0.0, 0.0), (0.0, 0.0, 0.0), 0,
-            np.zeros(1, np.float32),
+        sent[sequence] = Beacon(
+            robot_id=SENDER, sent=when, position_m=(true_s, 0.0, 0.0),
+            velocity_m_s=(0.0, 0.0, 0.0), frame_id=0, bundle_tag=0,
         )  # fmt: skip
 
     def receive(sequence: int, true_s: float) -> None:
-        message, now_s = sent[sequence], clock_of[RECEIVER].at(true_s)
-        age = None if message.sent is None else knows[RECEIVER].age_s(message.sent, now_s)
-        mailbox.receive(message, now_s, None if age is None else age.most_s)
+        beacon, now_s = sent[sequence], clock_of[RECEIVER].at(true_s)
+        age = None if beacon.sent is None else knows[RECEIVER].age_s(beacon.sent, now_s)
+        message = AggregatedMessage(np.zeros(1, np.float32))
+        table.receive(beacon, (1, sequence), message, now_s, None if age is None else age.most_s)
 
     happens: list[tuple[float, object]] = []
     held_s: dict[Trip, float] = {}
@@ -102,7 +104,7 @@ def test_no_place_that_is_older_than_allowed_is_fresh(
         do(true_s)  # type: ignore[operator]
         for later_s in (0.0, 0.3, MAX_AGE_S):
             now_s = clock_of[RECEIVER].at(true_s + later_s)
-            fresh = [n.position_m for n in mailbox.neighbours(now_s)]
-            fresh += [m.position_m for m in mailbox.swap(now_s)]
-            for said_at_s, _, _ in fresh:
+            for received in (*table.neighbours(now_s), *table.swap(now_s)):
+                assert received.beacon.position_m is not None
+                said_at_s, _, _ = received.beacon.position_m
                 assert true_s + later_s - said_at_s < MAX_AGE_S + TOLERANCE_S

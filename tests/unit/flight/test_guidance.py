@@ -13,7 +13,6 @@ from msgspec import structs
 
 from edge.core import F64
 from edge.core.fence import Fence
-from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.vehicle import Vector, VehicleState
@@ -27,6 +26,7 @@ from edge.flight.guidance import (
 from edge.flight.lift import Lift
 from edge.flight.safety import MotionLimits
 from edge.flight.state import FlightInputs, FlightMemory, FlightParameters, Robot
+from edge.messages.beacon import Neighbour
 from edge.messages.mission import FlightState
 
 TICK_S = 0.1

@@ -8,7 +8,6 @@ import pytest
 from msgspec import structs
 
 from edge.core.fence import Fence
-from edge.core.mailbox import Neighbour
 from edge.core.position import PositionCause, PositionJudgement, PositionQuality
 from edge.core.px4_version import in_words
 from edge.core.schema import ConfigError, from_mapping
@@ -22,7 +21,7 @@ from edge.flight.preflight import (
 from edge.flight.reach import Reach
 from edge.flight.safety import SeparationLimits
 from edge.flight.silence import SilenceLimits
-from edge.messages.beacon import Beacon, HeardBeacon, tag
+from edge.messages.beacon import Beacon, HeardBeacon, Neighbour, tag
 from edge.messages.codes import CheckCode
 from edge.messages.mission import FlightState, Origin
 
@@ -48,9 +47,7 @@ VEHICLE = VehicleState(
 )
 NEIGHBOUR = Beacon(
     robot_id=2,
-    boot_epoch=5,
-    sequence=9,
-    sent_at_s=UNIX_S,
+    sent=None,
     position_m=(16.0, 8.0, 0.0),
     velocity_m_s=(0.0, 0.0, 0.0),
     state=FlightState.IDLE,
@@ -85,7 +82,7 @@ READY = PreflightInputs(
     landing_point_m=(8.0, 8.0),
     min_separation_m=2.0,
     errors=ErrorBudget(),
-    neighbours=(HeardBeacon(NEIGHBOUR, 99.8),),
+    neighbours=(HeardBeacon(NEIGHBOUR, 99.8, 99.8),),
     not_understood=(),
     unheard=(),
     fell_silent=(),
@@ -227,6 +224,7 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
                         NEIGHBOUR, frame_id=7, armed=False, position_m=(8.0, 8.0, 0.0)
                     ),
                     99.8,
+                    99.8,
                 ),
             )
         },
@@ -365,7 +363,7 @@ def test_what_a_lost_autopilot_said_before_counts_for_nothing() -> None:
 
 
 def test_a_neighbour_without_an_origin_has_not_ours() -> None:
-    neighbour = HeardBeacon(dataclasses.replace(NEIGHBOUR, frame_id=0), 99.8)
+    neighbour = HeardBeacon(dataclasses.replace(NEIGHBOUR, frame_id=0), 99.8, 99.8)
     (failed,) = failed_checks(dataclasses.replace(READY, neighbours=(neighbour,)), LIMITS)
     assert failed.code is _C.OTHER_ORIGIN
 
@@ -377,7 +375,7 @@ def in_the_air(*flown_s: float | None) -> tuple[HeardBeacon, ...]:
             dataclasses.replace(
                 NEIGHBOUR, robot_id=2 + i, system_id=2 + i, state=FlightState.HOLD, armed=True,
                 flown_s=each_s, slot_height_m=9.5 + 4.5 * i, landing_point_m=(16.0 + 8.0 * i, 8.0),
-            ), 99.8,
+            ), 99.8, 99.8,
         )
         for i, each_s in enumerate(flown_s)
     )  # fmt: skip
@@ -417,7 +415,7 @@ def lines(
     neighbour = dataclasses.replace(
         NEIGHBOUR, landing_point_m=(landing_x_m, 8.0), gps_accuracy_m=its_accuracy_m
     )
-    heard = HeardBeacon(neighbour, 99.8)
+    heard = HeardBeacon(neighbour, 99.8, 99.8)
     vehicle = structs.replace(VEHICLE, gps=own)
     inputs = dataclasses.replace(READY, vehicle=vehicle, neighbours=(heard,), errors=errors)
     failed = failed_checks(inputs, LIMITS)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from edge.core import F64
 from edge.core.fence import Fence
-from edge.core.mailbox import Neighbour
 from edge.core.schema import ConfigError, from_mapping
 from edge.flight.safety import (
     Closest,
@@ -27,6 +26,7 @@ from edge.flight.safety import (
     nearest,
 )
 from edge.flight.silence import SilenceLimits
+from edge.messages.beacon import Neighbour
 
 SQUARE = ((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0))
 FENCE = Fence(SQUARE, buffer_m=2.0, floor_m=3.0, ceiling_m=25.0)

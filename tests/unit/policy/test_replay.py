@@ -42,7 +42,7 @@ def fly(policy: LpacPolicy, payload: PayloadType = "float16", ticks: int = 6) ->
         seen = Surroundings(robot)
         robots.append(
             Pac(
-                robot_id=robot, boot_epoch=1, policy=policy, sensor=seen, odometry=seen,
+                robot_id=robot, policy=policy, sensor=seen, odometry=seen,
                 parameters=parameters,
             )
         )  # fmt: skip
@@ -57,7 +57,8 @@ def fly(policy: LpacPolicy, payload: PayloadType = "float16", ticks: int = 6) ->
             assert sent is not None
             for robot, receiver in enumerate(robots):
                 if robot != sender:
-                    assert receiver.receive(sent.message, now_s) is None
+                    beacon = robots[sender].beacon(now_s)
+                    assert receiver.receive(beacon, (1, tick), sent.message, now_s) is None
         perceived, step = seen_ticks[0], done[0]
         assert perceived is not None and step is not None
         for topic, message in (
@@ -147,7 +148,7 @@ def test_a_logged_nan_is_a_difference(shipped_policy: LpacPolicy) -> None:
         ("perception", lambda m: m.update(features=None), "features: is NoneType; .* needs"),
         ("policy", lambda m: m.update(degree=1), "degree = 1: must be at least 2, the payloads"),
         ("policy", lambda m: m.update(payloads=[np.zeros(3)]), r"payloads: is \(3,\)"),
-        ("policy", lambda m: m.update(message=m["message"][:-1]), "refused: checksum"),
+        ("policy", lambda m: m.update(message=m["message"][:-1]), "refused: compression"),
         ("policy", lambda m: m.update(message=b""), "refused: truncated"),
     ],
 )

@@ -11,6 +11,7 @@ from edge.core import F32, F64
 from edge.core.aggregation import Geometry
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
+from edge.messages.beacon import decode_beacon, encode_beacon
 from edge.policy.bundle import Bundle
 from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages
 from edge.policy.lpac.policy import LpacPolicy, position_feature
@@ -226,12 +227,12 @@ class Still:
 def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: LpacPolicy) -> None:
     """Images, mailboxes and encoded messages of ten robots, against LPAC on the whole swarm."""
     random = np.random.default_rng(3)
-    places_m = random.uniform(0, 32, (10, 2))
+    places_m = random.uniform(0, 32, (10, 2)).round(3)  # Beacons tell places to 1 mm.
     parameters = PacParameters(scale=ModelScale(16.0, 1.0), max_speed_m_s=100.0, payload="float32")
     still = [Still((*place, 2.0), random.random((64, 64), np.float32)) for place in places_m]
     robots = [
         Pac(
-            robot_id=i, boot_epoch=1, policy=shipped_policy, sensor=still[i], odometry=still[i],
+            robot_id=i, policy=shipped_policy, sensor=still[i], odometry=still[i],
             parameters=parameters,
         )
         for i in range(10)
@@ -247,8 +248,9 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: L
         ticks = [robot.infer(now_s) for robot in robots]
         for i, robot in enumerate(robots):
             for j, sent in enumerate(ticks):
+                beacon = decode_beacon(encode_beacon(robots[j].beacon(now_s)), j)
                 if i != j:
-                    assert sent and robot.receive(sent.message, now_s) is None
+                    assert sent and robot.receive(beacon, (1, tick), sent.message, now_s) is None
     velocities = np.array([robot.control(now_s) for robot in robots], np.float32)
 
     neighbours = np.hypot(*(places_m[:, None] - places_m[None]).T) < 16.0

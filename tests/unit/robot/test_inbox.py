@@ -13,6 +13,7 @@ from edge.identity.guard import Speaker
 from edge.messages.codec import encode
 from edge.messages.mission import Echo, GroundState, Hold, Order, OrderForm, Origin
 from edge.robot.inbox import Inbox
+from edge.robot.neighbours import NeighbourTable
 from tests.unit.flight.test_preflight import NEIGHBOUR
 
 ANYBODY = Speaker(Role.OPERATOR, "")
@@ -28,7 +29,6 @@ def make_inbox() -> Inbox:
 def test_nothing_heard_is_infinitely_old() -> None:
     assert make_inbox().ground(10.0) == (None, math.inf)
     assert make_inbox().order(0.0) is None
-    assert make_inbox().peers(10.0) == ()
     assert make_inbox().ground_unix_s(10.0) is None
 
 
@@ -120,7 +120,6 @@ def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     inbox.put_order(data, ANYBODY, 0.0)
     assert inbox.ground(2.0) == (STATE, 1.0)
     assert inbox.order(0.0) is None
-    assert inbox.peers(2.0) == ()
     assert inbox.not_understood_count == 2
 
 
@@ -173,36 +172,15 @@ def test_of_orders_that_are_not_understood_only_kill_is_obeyed() -> None:
     assert inbox.not_understood_count == 4
 
 
-def test_peers_are_who_was_heard_lately_and_the_newest_counts() -> None:
-    inbox = make_inbox()
-    inbox.put_beacon(NEIGHBOUR, 1.0)
-    late = dataclasses.replace(NEIGHBOUR, sequence=8, slot_height_m=50.0)
-    inbox.put_beacon(late, 1.1)
-    assert [peer.beacon for peer in inbox.peers(1.2)] == [NEIGHBOUR]
-    restarted = dataclasses.replace(NEIGHBOUR, boot_epoch=6, sequence=1)
-    inbox.put_beacon(restarted, 1.3)
-    inbox.put_beacon(dataclasses.replace(NEIGHBOUR, robot_id=1), 2.0)
-    assert [peer.beacon.robot_id for peer in inbox.peers(2.5)] == [1, 2]
-    assert [peer.heard_at_s for peer in inbox.peers(4.5)] == [2.0]
-    # Its clock was set back while it was away.
-    inbox.put_beacon(NEIGHBOUR, 5.0)
-    assert [peer.beacon for peer in inbox.peers(5.1)] == [NEIGHBOUR]
-    # So also where nobody asked in between.
-    older = dataclasses.replace(NEIGHBOUR, sequence=1)
-    inbox.put_beacon(older, 8.1)
-    assert [peer.beacon for peer in inbox.peers(8.2)] == [older]
-
-
 def test_who_speaks_another_version_is_named_for_as_long_as_it_does() -> None:
     inbox = make_inbox()
     inbox.put_stranger("robot 4", 1.0)
     for now_s, names in ((2.0, ["robot 4"]), (4.5, [])):
-        assert inbox.peers(now_s) == ()
-        assert list(inbox.not_understood) == names
+        assert list(inbox.strangers(now_s)) == names
 
 
 def test_whom_the_ground_hears_and_this_robot_does_not() -> None:
-    inbox = make_inbox()
+    inbox, table = make_inbox(), NeighbourTable(3)
 
     def unheard(now_s: float, *named: int, heard: bool = False) -> tuple[int, ...]:
         """What the robot says then, whom the ground has just named."""
@@ -210,10 +188,9 @@ def test_whom_the_ground_hears_and_this_robot_does_not() -> None:
         inbox.put_ground(encode(state), ANYBODY, now_s)
         inbox.ground(now_s)
         if heard:
-            beacon = dataclasses.replace(NEIGHBOUR, robot_id=2, sequence=int(now_s * 10.0))
-            inbox.put_beacon(beacon, now_s)
-        inbox.peers(now_s)
-        return inbox.unheard(now_s)
+            table.receive(NEIGHBOUR, (1, int(now_s * 10.0)), None, now_s, None)
+        inbox.strangers(now_s)
+        return inbox.unheard(now_s, table)
 
     # Its program has only just begun.
     assert [unheard(now_s, 2, 3) for now_s in (1.0, 2.0, 4.0, 5.9)] == [()] * 4

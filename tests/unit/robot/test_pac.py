@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from edge.core.frames import ModelScale
 from edge.core.part import PartError
 from edge.core.ports import Look, Odometry
 from edge.core.wire import Rejection, decode, encode
+from edge.messages.beacon import Beacon, tag
 from edge.policy.bundle import Bundle, BundleError, Manifest
 from edge.policy.family import GoldenCheck, Observation, Perceived, Policy, PolicyStep
 from edge.policy.lpac.policy import LpacPolicy
@@ -44,7 +46,7 @@ def make_robot(
     policy: Policy, world: World, robot_id: int = 1, parameters: PacParameters = PARAMETERS
 ) -> Pac:
     robot = Pac(
-        robot_id=robot_id, boot_epoch=1, policy=policy, sensor=world, odometry=world,
+        robot_id=robot_id, policy=policy, sensor=world, odometry=world,
         parameters=parameters,
     )  # fmt: skip
     robot.clock.hear(GROUND, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
@@ -55,13 +57,22 @@ def fill(policy: LpacPolicy, value: float) -> F32:
     return np.full(policy.geometry.message_size, value, np.float32)
 
 
-def message(policy: LpacPolicy, robot_id: int = 2, value: float = 0.1, **changes: object) -> bytes:
-    fields = {
-        "robot_id": robot_id, "boot_epoch": 1, "sequence": 1, "sent": FleetTime(GROUND, 0.0, 0.0),
+class Said(NamedTuple):
+    beacon: Beacon
+    number: tuple[int, int]
+    data: bytes
+
+
+def message(
+    policy: LpacPolicy, robot_id: int = 2, value: float = 0.1, sequence: int = 1, **changes: Any
+) -> Said:
+    told: dict[str, Any] = {
+        "robot_id": robot_id, "sent": FleetTime(GROUND, 0.0, 0.0),
         "position_m": (18.0, 16.0, 3.0), "velocity_m_s": (0.0, 0.0, 0.0), "frame_id": 0,
-        "payload": fill(policy, value), **changes,
+        "bundle_tag": tag(policy.bundle_id.hex()), **changes,
     }  # fmt: skip
-    return encode(AggregatedMessage(**fields), policy.bundle_id, "float32")  # type: ignore[arg-type]
+    data = encode(AggregatedMessage(fill(policy, value)), "float32")
+    return Said(Beacon(**told), (1, sequence), data)
 
 
 def test_a_robot_perceives_infers_and_moves_within_the_speed_limit(
@@ -168,18 +179,11 @@ def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
     for tick, heard in enumerate(((2, 3), (2,), ())):
         now_s = 0.4 * tick
         for robot_id in heard:
-            robot.receive(message(shipped_policy, robot_id, sequence=tick + 1), now_s)
+            robot.receive(*message(shipped_policy, robot_id, sequence=tick + 1), now_s)
         robot.perceive(now_s)
         sent = robot.infer(now_s)
         assert sent is not None
-        own.append(
-            decode(
-                sent.message,
-                bundle_id=shipped_policy.bundle_id,
-                frame_id=0,
-                message_size=870,
-            )
-        )
+        own.append(decode(sent.message, message_size=870))
     # The last values of x_0 are the position, times 1/sqrt(degree).
     x = [m.payload[33] for m in own if isinstance(m, AggregatedMessage)]
     np.testing.assert_allclose(x, np.array([1.0, 1.0, np.sqrt(2.0)]) / np.sqrt(2.0), rtol=1e-6)
@@ -220,8 +224,8 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
     velocities = []
     for heard in ([], [message(shipped_policy)], [message(shipped_policy, position_m=(40, 16, 3))]):
         robot = make_robot(shipped_policy, World())
-        for data in heard:
-            assert robot.receive(data, 0.0) is None
+        for said in heard:
+            assert robot.receive(*said, 0.0) is None
         robot.perceive(0.0)
         robot.infer(0.0)
         velocity = robot.control(0.0)
@@ -232,7 +236,7 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
     np.testing.assert_array_equal(alone, beside_far)  # 24 m is beyond the range of 16 m
 
     robot = make_robot(shipped_policy, World())
-    robot.receive(message(shipped_policy), 0.0)
+    robot.receive(*message(shipped_policy), 0.0)
     robot.perceive(0.8)
     robot.infer(0.8)
     velocity = robot.control(0.8)
@@ -243,29 +247,20 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
 def test_what_a_robot_must_not_hear_is_counted(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     good = message(shipped_policy)
-    # Another bundle's robots' ids are not ours.
-    other = encode(
-        AggregatedMessage(
-            1, 1, 1, None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, fill(shipped_policy, 0.0)
-        ),
-        bytes(32),
-        "float32",
-    )
     cases = {
         Rejection.OWN: message(shipped_policy, robot_id=1),
-        Rejection.OTHER_BUNDLE: other,
-        Rejection.TRUNCATED: good[:50],
-        Rejection.CHECKSUM: good[:-1] + bytes([good[-1] ^ 1]),
-        Rejection.NON_FINITE: message(shipped_policy, value=float("nan")),
-        Rejection.STALE: message(shipped_policy, sequence=2, sent=FleetTime(GROUND, -1.0, 0.0)),
-        Rejection.AGE_UNKNOWN: message(shipped_policy, sequence=2, sent=None),
-        Rejection.IMPOSSIBLE: message(shipped_policy, boot_epoch=2**63),
+        Rejection.OTHER_BUNDLE: message(shipped_policy, bundle_tag=1, sequence=2),
+        Rejection.COMPRESSION: good._replace(number=(1, 3), data=good.data[:20]),
+        Rejection.NON_FINITE: message(shipped_policy, value=float("nan"), sequence=4),
+        Rejection.STALE: message(shipped_policy, sequence=5, sent=FleetTime(GROUND, -1.0, 0.0)),
+        Rejection.AGE_UNKNOWN: message(shipped_policy, sequence=6, sent=None),
+        Rejection.OUTDATED: message(shipped_policy, sequence=6),
     }
-    assert robot.receive(good, 0.0) is None
-    for reason, data in cases.items():
-        assert robot.receive(data, 0.0) is reason
-        assert robot.mailbox.counts()[reason] == 1
-    assert robot.mailbox.counts()["accepted"] == 1
+    assert robot.receive(*good, 0.0) is None
+    for reason, said in cases.items():
+        assert robot.receive(*said, 0.0) is reason
+        assert robot.table.counts()[reason] == 1
+    assert robot.table.counts()["accepted"] == 1
 
 
 def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_bundle: Bundle) -> None:
@@ -273,11 +268,11 @@ def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_bundle: 
     shipped = LpacPolicy(shipped_bundle)
     robot = make_robot(shipped, World())
     absurd = message(shipped, value=3e38)
-    assert robot.receive(absurd, 0.0) is Rejection.PAYLOAD_RANGE
+    assert robot.receive(*absurd, 0.0) is Rejection.PAYLOAD_RANGE
     without = dataclasses.replace(shipped_bundle.manifest, payload_limit=None)
     robot = make_robot(LpacPolicy(dataclasses.replace(shipped_bundle, manifest=without)), World())
-    assert robot.receive(absurd, 0.0) is None
-    assert robot.receive(message(shipped, robot_id=3, value=3e38), 0.0) is None
+    assert robot.receive(*absurd, 0.0) is None
+    assert robot.receive(*message(shipped, robot_id=3, value=3e38), 0.0) is None
     robot.perceive(0.0)
     with np.errstate(over="ignore", invalid="ignore"):
         assert robot.infer(0.0) is None
@@ -496,11 +491,11 @@ def test_a_look_that_is_none_is_not_used(
 
 def test_a_new_mission_forgets_map_and_messages(shipped_policy: LpacPolicy) -> None:
     flown, fresh = (make_robot(shipped_policy, World()) for _ in range(2))
-    flown.receive(message(shipped_policy), 0.0)
+    flown.receive(*message(shipped_policy), 0.0)
     flown.perceive(0.0)
     assert flown.infer(0.0) is not None
     flown.forget()
-    assert flown.mailbox.neighbours(0.0) == ()
+    assert flown.table.neighbours(0.0) == ()
     assert flown.infer(0.1) is None  # no features yet
     dark = World(seen=np.zeros((64, 64), np.float32))
     for robot in (flown, fresh):
@@ -513,8 +508,8 @@ def test_a_new_mission_forgets_map_and_messages(shipped_policy: LpacPolicy) -> N
 def test_messages_of_another_mission_frame_are_not_listened_to(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     robot.frame_id = 8
-    assert robot.receive(message(shipped_policy), 0.0) is Rejection.OTHER_FRAME
-    assert robot.receive(message(shipped_policy, frame_id=8), 0.0) is None
+    assert robot.receive(*message(shipped_policy), 0.0) is Rejection.OTHER_FRAME
+    assert robot.receive(*message(shipped_policy, frame_id=8, sequence=2), 0.0) is None
 
 
 def test_what_others_have_seen_is_heard_within_one_mission(sharing_bundle: Bundle) -> None:
@@ -528,7 +523,8 @@ def test_what_others_have_seen_is_heard_within_one_mission(sharing_bundle: Bundl
         other.perceive(now_s)
         tick = other.infer(now_s)
         assert tick is not None
-        assert robot.receive(tick.message, now_s) is None
+        number = 1, round(10.0 * now_s)
+        assert robot.receive(other.beacon(now_s), number, tick.message, now_s) is None
         perceived = robot.perceive(now_s)
         assert perceived is not None
         return float(perceived.inputs["images"][0, 3].mean()) * 256**2
@@ -565,7 +561,7 @@ def test_no_message_goes_without_a_map_while_a_new_mission_begins(sharing_bundle
     def infer() -> None:
         tick = robot.infer(0.2)
         assert tick is not None
-        told.append(other.receive(tick.message, 0.2))
+        told.append(other.receive(robot.beacon(0.2), (1, 1), tick.message, 0.2))
 
     meanwhile.append(lambda: robot.forget("second"))
     robot.perceive(0.0)
@@ -573,5 +569,5 @@ def test_no_message_goes_without_a_map_while_a_new_mission_begins(sharing_bundle
     robot.perceive(0.2)
     assert told == [None] and not meanwhile
     # The map is still that of the mission before.
-    (neighbour,) = other.mailbox.neighbours(0.2)
-    assert neighbour.shared is not None and neighbour.trial == 0
+    (neighbour,) = other.table.neighbours(0.2)
+    assert neighbour.message.shared is not None and neighbour.message.trial == 0
