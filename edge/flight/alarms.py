@@ -1,6 +1,6 @@
-"""Alarms of a robot in flight, for its operator, the gravest first.
+"""Alarms of a robot in flight for its operator, most severe first.
 
-Each condition gives the text of its alarm, or None; the table of transitions and the orders ask
+Each condition gives the text of its alarm, or None. The table of transitions and the orders use
 some of them, too.
 """
 
@@ -13,7 +13,7 @@ from edge.flight.state import Tick
 from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import AIRBORNE, FlightState
 
-# Some messages of silence are no loss: PX4 tells five times a second.
+# PX4 reports five times a second; a few missing messages are no loss.
 _REMOTE_CONTROL_LOST_S = 1.0
 
 
@@ -36,7 +36,7 @@ def hovers_alone(t: Tick) -> str | None:
 def remote_control_lost(t: Tick) -> str | None:
     if t.robot.on_remote_control_lost is None or t.inputs.vehicle.remote_control or t.silent:
         return None
-    # A program that was started in flight has not heard it yet.
+    # A program started in flight has not heard it yet.
     heard_at_s = t.flight.remote_control_at_s
     lost_s = t.inputs.now_s - (heard_at_s if heard_at_s > -math.inf else t.flight.since_s)
     return reason_if(lost_s > _REMOTE_CONTROL_LOST_S, "remote control lost")
@@ -148,7 +148,7 @@ ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
 }
 
 
-# Before takeoff, too.
+# Also before takeoff.
 _LINK_ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
     ReasonCode.LINK_LOSES: link_loses,
     ReasonCode.LINK_TWICE: link_twice,
@@ -157,7 +157,7 @@ _IN_FLIGHT = {**ALARMS, **_LINK_ALARMS}
 
 
 def alarms(t: Tick) -> tuple[Reason, ...]:
-    """Present alarms, the gravest first, each thing once."""
+    """Present alarms, most severe first, without repetition."""
     found = [t.flight.reason] if t.flight.alarming else []
     in_flight = t.flight.state in (*AIRBORNE, FlightState.PILOT)
     conditions = _IN_FLIGHT if in_flight else _LINK_ALARMS

@@ -1,7 +1,7 @@
-"""How long the battery lasts, and how long the way home takes; nothing here has a clock.
+"""Battery endurance, and time needed for the way home; no clock is used.
 
-A percentage alone does not tell: packs age, and the one whose slot is highest waits longest. The
-consumption of this flight is measured, so that a weak pack shows after a minute.
+A percentage alone is not enough: packs age, and the robot in the highest slot waits longest to
+land. The consumption is measured in flight, so a weak pack shows after a minute.
 """
 
 import math
@@ -15,19 +15,19 @@ from msgspec import Meta
 
 from edge.core.schema import Bounded
 
-# The voltage falls when the motors start, and PX4's estimate of the charge with it.
+# The voltage drops when the motors start, and with it PX4's estimate of the charge.
 _SETTLED_S = 15.0
-# A share comes in whole percents.
+# Shares are whole percents.
 _SAMPLE_S = 5.0
 _SAMPLES = 36
 _LEAST_MEASURED_S = 60.0
-# What is measured may say that a pack is worse than configured, but not that it lasts for ever.
+# A measurement may show a pack to be worse than configured, but at most this much better.
 _AT_LEAST_DRAIN = 0.5
-# One message that is wrong is not believed.
+# The median rejects a single wrong message.
 _MEDIAN_S = 5.0
-# Home is flown at less than full speed: there are corners, neighbours and wind.
+# The way home is flown below maximum speed: corners, neighbours and wind.
 _SPEED_SHARE = 0.7
-# PX4's MPC_LAND_SPEED is 0.7 m/s; and what it takes to find the ground and stop the motors.
+# PX4's MPC_LAND_SPEED is 0.7 m/s; and time to detect the ground and stop the motors.
 _LANDING_M_S, _TOUCHDOWN_S = 0.5, 5.0
 _UpToAnHour = Annotated[float, Meta(ge=0.0, le=3600.0)]
 
@@ -36,12 +36,12 @@ _UpToAnHour = Annotated[float, Meta(ge=0.0, le=3600.0)]
 class EnergyParameters(Bounded):
     """Endurance of a pack; times in s.
 
-    `endurance_s` is a flight with a full pack until it is empty, for as long as none was measured.
-    `cells` in series, 0 if not known: then `low_cell_v`, V per cell under load, is not looked at.
-    `queue_s`: for each lower slot, how long that robot may keep this one from landing. `reserve_s`
-    is left when it has landed.
+    `endurance_s` is the flight time of a full pack until it is empty, until one is measured.
+    `cells` in series, 0 if unknown, disables `low_cell_v`, V per cell under load. `queue_s` is the
+    time that a robot in each lower slot may delay this one's landing. `reserve_s` must be left
+    after landing.
 
-    Raises ValueError that names what is impossible.
+    Raises ValueError that names the impossible value.
     """
 
     endurance_s: Annotated[float, Meta(ge=60.0, le=36_000.0)] = 900.0
@@ -52,12 +52,11 @@ class EnergyParameters(Bounded):
 
 
 class Energy(NamedTuple):
-    """Flight time that is left, and that is needed.
+    """Available and required flight time.
 
-    `lasts_s` is how long the robot flies until its battery is critical, by this flight's drain.
-    `home_s` is what it takes from here until the vehicle has landed, with the wait before and the
-    reserve after; None where that is not known. `cell_v` is a cell's voltage now, None if not
-    known; `low_cell_v` the limit.
+    `lasts_s` is the time until the battery is critical, by this flight's consumption. `home_s` is
+    the time from here to landing, including the queue before and the reserve after; None if
+    unknown. `cell_v` is the present voltage of a cell, None if unknown; `low_cell_v` is its limit.
     """
 
     lasts_s: float
@@ -66,9 +65,9 @@ class Energy(NamedTuple):
     low_cell_v: float
 
     def shortage(self) -> str | None:
-        """Why the robot must go home, in words; None if it need not."""
+        """Reason why the robot must go home; None if it need not."""
         if self.home_s is not None and self.lasts_s < self.home_s:
-            # In steps, so that the same is told in the same words.
+            # Rounded, so that the text stays the same for a while.
             lasts_s, needs_s = math.floor(self.lasts_s / 10) * 10, math.ceil(self.home_s / 10) * 10
             return f"battery lasts {lasts_s} s more, home and landing take {needs_s} s"
         if self.cell_v is not None and self.cell_v < self.low_cell_v:
@@ -77,7 +76,7 @@ class Energy(NamedTuple):
 
 
 class Consumption:
-    """Estimator of the battery's endurance, flight by flight. For one thread."""
+    """Estimates the battery's endurance, flight by flight. Not thread-safe."""
 
     def __init__(self, parameters: EnergyParameters) -> None:
         self._parameters = parameters
@@ -88,13 +87,13 @@ class Consumption:
 
     @property
     def endurance_s(self) -> float:
-        """How long a full pack lasts: by this flight's drain, else the last one's, else as said."""
+        """Endurance of a full pack: measured in this or the last flight, else as configured."""
         return self._endurance_s
 
     def hear(
         self, now_s: float, armed: bool | None, share: float | None, voltage_v: float | None
     ) -> None:
-        """Take the autopilot's reading of the battery: its remaining share, and its voltage."""
+        """Add the autopilot's remaining share and voltage of the battery."""
         self._share.hear(now_s, share)
         if self._parameters.cells:
             self._voltage_v.hear(now_s, voltage_v)
@@ -115,7 +114,7 @@ class Consumption:
             self._endurance_s = 1.0 / max(_drain(self._samples), least)
 
     def energy(self, until_share: float, home_s: float | None) -> Energy | None:
-        """The estimate: `until_share` is when the battery is critical. None if nothing is heard."""
+        """Estimate with the critical share `until_share`; None without readings."""
         share, voltage_v = self._share.median(), self._voltage_v.median()
         if share is None:
             return None
@@ -132,7 +131,7 @@ class _Recent:
 
     def __init__(self) -> None:
         self._heard: deque[tuple[float, float | None]] = deque()
-        # The finite ones, in ascending order.
+        # The finite values, ascending.
         self._ordered: list[float] = []
 
     def hear(self, now_s: float, value: float | None) -> None:
@@ -146,7 +145,7 @@ class _Recent:
 
     def median(self) -> float | None:
         ordered = self._ordered
-        # A battery that is silent now is not known, whatever it said before.
+        # If the newest reading is missing, the battery is unknown.
         if not ordered or self._heard[-1][1] is None:
             return None
         middle, is_odd = divmod(len(ordered), 2)
@@ -154,10 +153,10 @@ class _Recent:
 
 
 def _drain(samples: deque[tuple[float, float]]) -> float:
-    """Share per s: the median of the slopes between all pairs, which a jump hardly moves."""
+    """Share per s: the median slope between all pairs, which is robust against jumps."""
     times_s, shares = np.array(samples).T
     i, j = np.triu_indices(len(times_s), 1)
-    # np.median would import a part of numpy, in flight.
+    # np.median would import a module in flight.
     slopes = np.sort((shares[i] - shares[j]) / (times_s[j] - times_s[i]))
     return float(0.5 * (slopes[(len(slopes) - 1) // 2] + slopes[len(slopes) // 2]))
 
@@ -172,7 +171,7 @@ def home_s(
     max_speed_m_s: float,
     max_climb_m_s: float,
 ) -> float:
-    """From `away_m` and `height_m` until the robot stands on its landing point, and the reserve."""
+    """Time from `away_m` and `height_m` to standing on the landing point, plus the reserve."""
     to_slot_s = abs(slot_height_m - height_m) / max_climb_m_s
     flight_s = away_m / (_SPEED_SHARE * max_speed_m_s)
     landing_s = slot_height_m / _LANDING_M_S + _TOUCHDOWN_S
@@ -195,10 +194,10 @@ def trials(
     max_speed_m_s: float,
     max_climb_m_s: float,
 ) -> int:
-    """How many trials a pack is good for: none counts in which the robot would return by itself.
+    """Number of trials that a pack allows, without any in which the robot would return early.
 
-    Each is a climb to the slot, a wait there for the others, `trial_s` of mission, and the way home
-    from `away_m`, the queue and the landing. Then the next takes off, with `min_battery` at least.
+    Each trial is a climb to the slot, a wait for the others, `trial_s` of mission, and the way home
+    from `away_m` with queue and landing. The next takeoff needs at least `min_battery`.
     """
     down_s = home_s(
         parameters,
@@ -211,7 +210,7 @@ def trials(
     )
     returns_at = max(battery_low, battery_critical + down_s / endurance_s)
     mission_s = 2.0 * slot_height_m / max_climb_m_s + trial_s
-    # What may be used before the last one begins.
+    # Share that may be used before the last trial begins.
     until = max(min_battery, returns_at + mission_s / endurance_s)
     each_s = mission_s + down_s - parameters.reserve_s
     return max(math.floor((share - until) * endurance_s / each_s) + 1, 0)

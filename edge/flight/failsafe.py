@@ -1,11 +1,11 @@
-"""PX4's parameters that decide what it does when something fails, and what they must be here.
+"""PX4's failsafe parameters, and their required values.
 
-What is said of PX4 holds for v1.14 and later. Its delay COM_FAIL_ACT_T, a hold before it acts,
-applies to a lost remote control or ground station, a critical battery, a motor or propeller that
-fails, and a fence that it answers with a return or a landing. It does not apply to a lost offboard
-signal or position, nor to traffic: those are acted on at once.
+Statements about PX4 hold for v1.14 and later. Its delay COM_FAIL_ACT_T, a hold before it acts,
+applies to a lost remote control or ground station, a critical battery, a failing motor or
+propeller, and to fence actions return and land. A lost offboard signal or position, and traffic,
+are acted on at once.
 
-No parameter says what happens when the position is lost.
+No parameter controls the action on a lost position.
 """
 
 import math
@@ -24,14 +24,14 @@ Parameters = Mapping[str, int | float | None]
 
 # Altitude drifts by 1.6 m under velocity setpoints.
 _CEILING_MARGIN_M = 2.0
-_ROUNDING = 1e-6  # A REAL32 parameter holds 0.3 as 0.30000001.
+_ROUNDING = 1e-6  # a REAL32 parameter holds 0.3 as 0.30000001
 
 _NO_FAILSAFE = "fly on with the last command: NO FAILSAFE"
 _STOP_MOTORS = "STOP ITS MOTORS and fall"
 _LAND = "land"
 _RETURN = "RETURN to where it was armed, at a height that all robots share"
 _RETURN_AND_LAND = f"{_RETURN}; land when it is nearly empty"
-# What PX4 does after a hold where it puts one first.
+# Actions that PX4 delays by a hold.
 _DELAYED = (_LAND, _RETURN, _RETURN_AND_LAND)
 _OFFBOARD_LOSS = {
     0: "hand over to the sticks, in position mode",
@@ -90,9 +90,9 @@ _OVERRIDE = {
 class Requirement:
     """Requirement of one parameter: one of `values`, or above `above` and up to `up_to`.
 
-    `value_to_set` is what to set it to, of the parameter's own type (int or float), and None if it
-    must be set by hand, since it counts after a reboot only. `means` says what PX4 does at a value.
-    A vehicle whose PX4 does not have the parameter is as safe without it if `may_be_absent`.
+    `value_to_set` has the parameter's own type (int or float); None if it must be set by hand,
+    since it takes a reboot. `means` describes PX4's action for a value. With `may_be_absent`, a PX4
+    without the parameter is just as safe.
     """
 
     name: str
@@ -109,7 +109,7 @@ class Requirement:
         return value in self.values or self.above < value <= self.up_to * (1.0 + _ROUNDING)
 
     def wanted(self) -> str:
-        """Describe the values that are allowed."""
+        """Text of the allowed values."""
         options = [self._in_words(value) for value in self.values]
         if self.above < math.inf:
             up_to = f" and up to {self.up_to:g}" if self.up_to < math.inf else ""
@@ -117,7 +117,7 @@ class Requirement:
         return " or ".join(options)
 
     def problem(self, value: float | None) -> str | None:
-        """Describe the fault of the vehicle's value, None where there is none."""
+        """Text of the fault of the vehicle's value; None if there is none."""
         if value is None:
             if self.may_be_absent:
                 return None
@@ -138,9 +138,9 @@ def required(
 
     `rc` "pilot": somebody holds a remote control and may take the vehicle at any time; "none":
     there is none, and PX4 must not wait for one. `ceiling_m` is the fence's. `command_timeout_s` is
-    the watchdog's, after which a robot that hangs holds; PX4 takes over later.
+    the watchdog's, after which it makes a hanging robot hold; PX4 takes over later.
 
-    Raises ValueError if one of them is out of its range.
+    Raises ValueError if one of them is out of range.
     """
     require(RemoteControl, rc, "rc")
     require(Positive, ceiling_m, "ceiling_m")
@@ -368,14 +368,14 @@ def _remote_control(rc: RemoteControl) -> tuple[Requirement, ...]:
     )
 
 
-# Every parameter that `check` and `explain` look at; what to read from the vehicle.
+# All parameters used by `check` and `explain`, to read from the vehicle.
 PARAMETERS = tuple(requirement.name for requirement in required("pilot", ceiling_m=1.0))
 
 
 def check(requirements: tuple[Requirement, ...], parameters: Parameters) -> tuple[str, ...]:
-    """Describe each fault of the vehicle's parameters in one plain line; empty if there is none.
+    """One line for each fault of the vehicle's parameters; empty if there is none.
 
-    A parameter that is missing from `parameters`, or None there, is not known.
+    A parameter that is missing from `parameters`, or None, is unknown.
     """
     problems = [
         problem
@@ -398,7 +398,7 @@ def check(requirements: tuple[Requirement, ...], parameters: Parameters) -> tupl
 
 
 def explain(parameters: Parameters) -> tuple[str, ...]:
-    """Say what this vehicle will do when something fails, by its parameters, one line each."""
+    """Describe this vehicle's reactions to failures by its parameters, one line each."""
     look_up = _LookUp(parameters)
     return (
         f"if this program dies, PX4 will: {_on_program_loss(look_up)}",
@@ -443,7 +443,7 @@ class _LookUp:
         return actions.get(setting, f"NOT KNOWN, since {name} = {setting} is not")
 
     def delayed(self, name: str, actions: Mapping[int, str]) -> str:
-        """The action, after a hold where PX4 puts one before it."""
+        """The action, preceded by a hold where PX4 delays it."""
         action = self.action(name, actions)
         delay_s = self.parameters.get("COM_FAIL_ACT_T")
         if action not in _DELAYED or (delay_s is not None and delay_s <= 0.1):

@@ -1,10 +1,10 @@
-"""Where to fly in each flight state: one control tick's setpoint in the mission frame.
+"""Guidance: one control tick's setpoint for the flight state, in the mission frame.
 
 Heights are above the robot's own takeoff point. HOLD, TAKEOFF and RETURN are flown as positions a
-short way ahead of the estimate, which PX4 stops at much sooner than at a velocity of 0, and which
-never lets the vehicle dash when the estimate jumps. MISSION is flown as a velocity. Neighbours and
-the fence limit MISSION and RETURN; in HOLD it makes room for neighbours, and comes back. While the
-position is in doubt, all of them stand still.
+short way ahead of the estimate: PX4 stops at these much sooner than at a velocity of 0, and the
+vehicle never dashes when the estimate jumps. MISSION is flown as a velocity. Neighbours and the
+fence limit MISSION and RETURN; HOLD makes room for neighbours and comes back. With a doubtful
+position the robot stands still in all of them.
 """
 
 import math
@@ -30,28 +30,28 @@ from edge.flight.safety import (
 from edge.flight.state import FlightInputs, FlightMemory, Robot, Tick, height_m, is_silent
 from edge.messages.mission import STEERED, FlightState
 
-# PX4 flies towards a position with about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P). That
-# must be more than what its estimated velocity is wrong by, with which the vehicle drifts: up to
-# 0.94 m/s in PX4's own simulation.
+# PX4 flies towards a position at about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P). This
+# must exceed the error of its estimated velocity, with which the vehicle drifts: up to 0.94 m/s in
+# PX4's own simulation.
 _HOLD_LEASH_M = 1.0
 _AHEAD_S = 1.0
-# RETURN flies nowhere before it is this near its own height.
+# RETURN does not move horizontally before it is this near its own height.
 _AT_OWN_HEIGHT_M = 1.0
-# Who was carried out of the fence parts from others only when it is so far inside again, as a share
-# of the buffer. HOLD then stays at half of it.
+# A robot that was carried out of the fence makes room only when it is this far inside again, as a
+# share of the buffer. HOLD then stays at half of it.
 _BACK_INSIDE_SHARE = 0.25
-# After a longer one than this nobody knows how far it has moved.
+# After a longer tick the movement is unknown.
 _LONGEST_TICK_S = 0.5
 
 
 class MissionVelocity(NamedTuple):
-    """Fly with this velocity: the mission frame, m/s."""
+    """Setpoint of a velocity in the mission frame, m/s."""
 
     velocity_m_s: Vector
 
 
 class MissionPosition(NamedTuple):
-    """Fly to x and y of the mission frame, at this height, m."""
+    """Setpoint of x and y in the mission frame, and a height, m."""
 
     position_m: Vector
 
@@ -63,7 +63,7 @@ _STOP = MissionVelocity(_NO_SPEED_M_S)
 
 
 class Parted(NamedTuple):
-    """Where HOLD stays instead of at its target, since it parted from others."""
+    """Replacement of HOLD's target after making room for others."""
 
     from_m: Vector
     to_m: Vector
@@ -71,8 +71,7 @@ class Parted(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guidance:
-    """Memory of guidance: the last commanded velocity (3,), a recovery to the fence, and where
-    HOLD has parted to."""
+    """Memory of guidance: last commanded velocity (3,), recovery to the fence, HOLD's new place."""
 
     velocity_m_s: F64 = field(default_factory=lambda: np.zeros(3))
     recovering: bool = False
@@ -86,9 +85,10 @@ def guide(
     guidance: Guidance,
     dt_s: float,
 ) -> tuple[MissionSetpoint | None, Guidance]:
-    """The setpoint of this tick, None when nothing is to be sent, and the memory for the next.
+    """This tick's setpoint, None to send nothing, and the memory for the next tick.
 
-    `flight` is what `step.step` made of the same inputs; `dt_s` is the time since the last tick.
+    `flight` is the result of `step.step` for the same inputs; `dt_s` is the time since the last
+    tick.
     """
     state, limits = flight.state, robot.limits
     if state not in (FlightState.ARMING, *STEERED) or is_silent(flight, inputs.now_s):
@@ -106,7 +106,7 @@ def guide(
     if state is FlightState.HOLD:
         return _hold(robot, flight, inputs, guidance, position_m, dt_s)
     if state is FlightState.TAKEOFF:
-        # Who fell silent may still hover where it was.
+        # A silent robot may still hover at its last place.
         silent = (each._replace(velocity_m_s=_NO_SPEED_M_S) for each in inputs.fell_silent)
         separation_m = robot.parameters.min_separation_m
         clear_m = clear_height_m(position_m, (*inputs.neighbours, *silent), separation_m)
@@ -141,7 +141,7 @@ def guide(
 
 
 def _stay(robot: Robot, flight: FlightMemory, height_m: float) -> MissionVelocity:
-    """Stand still at one height, by the estimate of motion alone."""
+    """Stand still at one height, by the estimated velocity alone."""
     wanted_m = robot.parameters.slot_height_m
     if flight.state is FlightState.TAKEOFF:
         wanted_m = height_m
@@ -174,7 +174,7 @@ def _hold(
     position_m: F64,
     dt_s: float,
 ) -> tuple[MissionSetpoint, Guidance]:
-    """At its target, or where it has got to since it parted from others; room for others."""
+    """Setpoint at the target, or at its replacement, with room for others."""
     target_m, parted, fence, limits = flight.target_m, guidance.parted, robot.fence, robot.limits
     if parted is not None and parted.from_m != target_m:
         parted = None
@@ -206,8 +206,8 @@ def _hold(
     pushed_m_s = (velocity_m_s - wanted_m_s)[:2]
     if not pushed_m_s.any():
         return place, Guidance(recovering=recovering, parted=parted)
-    # However many push it, and whatever they tell, it goes no further than this. Who is further
-    # away does not dash back through them.
+    # A bound, whatever neighbours do or send. A robot that is further away does not dash back
+    # through them.
     around_m = np.array(target_m[:2])
     farthest_m = max(robot.separation.landed_m, math.dist(target_m[:2], position_m[:2].tolist()))
     ahead_m = leash((position_m + velocity_m_s * _AHEAD_S)[:2], around_m, farthest_m)
@@ -217,7 +217,7 @@ def _hold(
     if goal_m is None:
         return _STOP, Guidance()
     if left_m is not None:
-        # It does not come back over somebody whom it hears no more.
+        # Do not come back over a neighbour that is no longer heard.
         x_m, y_m = left_m.tolist()
         x_m, y_m = fence.moved_inside_m(x_m, y_m, fence.buffer_m)
         parted = Parted(target_m, (x_m, y_m, target_m[2]))
@@ -226,7 +226,7 @@ def _hold(
 
 
 def _homewards(robot: Robot, inputs: FlightInputs, position_m: F64) -> F64:
-    """(2,): towards where it comes down, once at the robot's own height."""
+    """Velocity (2,) towards the place of landing, 0 before the robot is at its own height."""
     if abs(position_m[2] - robot.parameters.slot_height_m) >= _AT_OWN_HEIGHT_M:
         return np.zeros(2)
     landing_m = inputs.lands_beside_m or robot.parameters.landing_point_m

@@ -1,6 +1,6 @@
-"""Where a robot may come down: its landing point, or beside it where another robot stands there.
+"""Place of landing: the landing point, or beside it if another robot stands there.
 
-LAND looks for nobody, so a robot that comes home looks before. Mission frame, m; pure.
+LAND does not avoid robots, so a returning robot checks before. Mission frame, m; pure.
 """
 
 import math
@@ -18,17 +18,17 @@ from edge.messages.mission import FlightState
 
 Point = tuple[float, float]
 
-# Who stands that near to its own landing point has landed on it: errors walk, and gusts blow.
+# A robot this near to its own landing point has landed on it, given drift and gusts.
 _ON_ITS_OWN_M = 2.0
-# A place that was chosen is kept though who stands there seems to move a little.
+# A chosen place is kept despite small apparent movements of standing robots.
 _KEPT_M, _KEPT_SHARE = 2.0, 0.25
 _GRID_M = 2.0
 
 
 class StandingRobot(NamedTuple):
-    """Another robot on the ground, motors off: where it is, and where it lands itself.
+    """Another robot on the ground, motors off: its place and its own landing point.
 
-    It may be `strays_m` beside that place.
+    It may be up to `strays_m` beside the place.
     """
 
     robot_id: int
@@ -37,17 +37,17 @@ class StandingRobot(NamedTuple):
     strays_m: float = 0.0
 
     def away_m(self, place_m: Point) -> float:
-        """How far it is from a place, at least."""
+        """Least distance from a place."""
         return math.dist(self.place_m, place_m) - self.strays_m
 
     @property
     def is_on_its_own(self) -> bool:
-        """Whether that is the same, which is checked to be far from all other landing points."""
+        """Whether it is at its own landing point, which is checked to be far from all others."""
         return math.dist(self.place_m, self.landing_point_m) <= _ON_ITS_OWN_M
 
 
 def standing_robots(beacons: Iterable[Beacon]) -> list[StandingRobot]:
-    """Those who say that they are on the ground, or come down to it, and where; of one frame."""
+    """Robots that report to be on the ground or landing, with their places; of one frame."""
     return [
         StandingRobot(beacon.robot_id, beacon.position_m[:2], beacon.landing_point_m)
         for beacon in beacons
@@ -59,9 +59,9 @@ def standing_robots(beacons: Iterable[Beacon]) -> list[StandingRobot]:
 def may_stand(
     silent: Neighbour, its_landing_point_m: Point, limits: SilenceLimits
 ) -> list[StandingRobot]:
-    """Places where a robot that fell silent in flight may stand, as if it had landed on its way.
+    """Places where a robot that fell silent in flight may stand, after landing on its way.
 
-    It is down some time, unheard.
+    It comes down at some time, unheard.
     """
     stopped = silent._replace(age_s=max(silent.age_s, limits.flies_on_s))
     return [
@@ -73,7 +73,7 @@ def may_stand(
 def in_the_way(
     landing_point_m: Point, standing: Iterable[StandingRobot], errors: ErrorBudget
 ) -> list[tuple[StandingRobot, float]]:
-    """Robots that stand at that landing point, which is not their own; and how far from it, m."""
+    """Robots standing at this landing point but not at their own, and their distances, m."""
     apart = places_apart(errors.position_m, errors.position_m)
     away = [(each, each.away_m(landing_point_m)) for each in standing]
     return [(each, m) for each, m in away if not apart.holds(m) and not each.is_on_its_own]
@@ -87,11 +87,11 @@ def place_to_land(
     fence: Fence,
     errors: ErrorBudget,
 ) -> Point | None:
-    """The nearest place inside the fence that is free, or as free as any; None: the landing point.
+    """The nearest free place inside the fence, or the freest; None for the landing point.
 
-    Free is what is as far from who stands, and from `others_m`, as landing points must be from each
-    other: those are the others' landing points, and where those are who return and go first.
-    `before_m` is what was chosen last, and is kept while it is free.
+    Free is a distance from standing robots and from `others_m` as required of landing points.
+    `others_m` are the others' landing points, and the places of robots that return first.
+    `before_m`, the last choice, is kept while it is free.
     """
     if not in_the_way(landing_point_m, standing, errors):
         return None

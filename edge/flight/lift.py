@@ -1,32 +1,31 @@
-"""Whether the vehicle holds its height, and whether it stands on the ground.
+"""Detects a vehicle that does not hold its height, or stands on the ground.
 
-The autopilot reports neither of a vehicle whose motors lift too little: told to climb, it pushes
-against the ground and takes itself to be in the air. Height, climb rate and thrust tell. Nothing
-here has a clock.
+The autopilot reports neither if the motors lift too little: commanded to climb, it pushes against
+the ground and reports to be in the air. Height, climb rate and thrust reveal it. No clock is used.
 """
 
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-# No error of control keeps it so far from its height for so long; others fly there.
+# No control error lasts this long at this distance from its height, where others fly.
 OFF_HEIGHT_M, _OFF_S = 1.5, 2.0
-# Nothing that flies keeps a height for so long at a thrust so far from the one that carries it.
+# No flying vehicle keeps its height this long with a thrust this far from the hover thrust.
 _STANDS_S = 2.0
 _STILL_M_S = 0.3
 _FALLS_SHARE, _CLIMBS_SHARE, _FULL_THRUST = 0.5, 1.2, 0.95
-# The thrust that carries it is learned near its height.
+# The hover thrust is learned near the robot's height.
 _AT_HEIGHT_M, _LEARNED_WITHIN_S = 0.5, 10.0
-# After a longer pause nobody knows what it did.
+# After a longer pause the motion is unknown.
 _LONGEST_TICK_S = 0.5
 
 
 class Motion(NamedTuple):
-    """A vehicle's motion in one tick; heights above the takeoff point; None is not known.
+    """A vehicle's motion in one tick; heights above the takeoff point; None if unknown.
 
-    `wanted_m` is the height that it is told to keep or to reach, None if it is told to land, and
-    `approach_m_s` how fast it comes nearer to that at least: 0 if it may pause on its way.
-    `ground_below_m` is the greatest height that it may be told of while it stands on the ground.
+    `wanted_m` is the commanded height, None while landing; `approach_m_s` the least rate of
+    approach to it, 0 if the vehicle may pause. `ground_below_m` is the highest estimate possible on
+    the ground.
     """
 
     height_m: float | None
@@ -42,9 +41,9 @@ class Motion(NamedTuple):
 class Lift:
     """State kept from tick to tick.
 
-    `slack_m` is how far it may still be from its height, since it is on its way. It has been
-    further off since `off_since_s`, and moved and pushed as what stands since `stands_since_s`;
-    None if it does not. `hover_thrust` is what carries it, None before it was at its height.
+    `slack_m` is the permitted distance from the height on the way to it. The vehicle has exceeded
+    it since `off_since_s`, and behaves like a standing one since `stands_since_s`; None if it does
+    not. `hover_thrust` is None before the vehicle was at its height.
     """
 
     slack_m: float = math.inf
@@ -53,21 +52,21 @@ class Lift:
     hover_thrust: float | None = None
 
     def off_s(self, now_s: float) -> float:
-        """For how long it has been known not to hold its height, s; below 0 if it is not."""
+        """Time for which the height has been lost, s; below 0 if it is not."""
         return -math.inf if self.off_since_s is None else now_s - self.off_since_s - _OFF_S
 
     def stands(self, now_s: float) -> bool:
-        """Whether it stands on the ground, whatever the autopilot says."""
+        """Whether the vehicle stands on the ground, whatever the autopilot reports."""
         since_s = self.stands_since_s
         return since_s is not None and now_s - since_s >= _STANDS_S
 
     def entered(self, *, steered: bool) -> "Lift":
-        """The same in a new state. A lost height is forgotten only where nobody steers it."""
+        """The state after a transition. A lost height is forgotten only if nothing steers."""
         return replace(self, slack_m=math.inf, off_since_s=self.off_since_s if steered else None)
 
 
 def look(lift: Lift, motion: Motion, now_s: float, dt_s: float) -> Lift:
-    """The memory after a tick that came `dt_s` after the last one."""
+    """The state after a tick that came `dt_s` after the last one."""
     dt_s = min(max(dt_s, 0.0), _LONGEST_TICK_S)
     off_m = math.nan
     if motion.height_m is not None and motion.wanted_m is not None:
@@ -103,6 +102,6 @@ def _seems_to_stand(motion: Motion, hover_thrust: float | None, *, is_lost: bool
         return True
     if motion.wanted_m is None:
         return False
-    # Told to climb, or where it came to rest after it sank, it pushes and does not rise.
+    # Commanded to climb, or at rest after sinking, it pushes and does not rise.
     climbs = is_lost or height_m < motion.wanted_m - OFF_HEIGHT_M
     return climbs and thrust > min(_CLIMBS_SHARE * hover_thrust, _FULL_THRUST)

@@ -1,7 +1,7 @@
-"""Margins that follow from errors: how far apart, how high, how far inside, how far around.
+"""Margins from errors: between robots, to the ground, inside and around the fence.
 
-Each margin is a sum of errors that a vehicle may have at once, each at its worst and the wrong way
-round, so that truth holds whatever the estimates say. docs/safety.md shows the same sums.
+Each margin is a sum of errors that a vehicle may have at once, each at its worst and in the worst
+direction, so that it holds in truth whatever the estimates are. docs/safety.md shows the sums.
 """
 
 import functools
@@ -12,49 +12,49 @@ from typing import NamedTuple
 from edge.core.schema import Bounded, NonNegative, Positive
 from edge.flight.safety import MotionLimits, stopping_m
 
-# A receiver reports a radius that holds its error 68 % of the time. If errors are normal, twice
-# that holds 99 % of them.
+# A receiver reports a radius that contains its error 68 % of the time. Twice that contains 99 % of
+# normal errors.
 _REPORT_FACTOR = 2.0
-# Without a report a receiver counts as one without corrections, whatever is configured.
+# A receiver without a report counts as one without corrections, whatever is configured.
 _UNREPORTED_M = 3.0
 _GRAVITY_M_S2 = 9.81
-# In which time all heights walk together by `height_common_m`.
+# Time in which all heights drift together by `height_common_m`.
 _COMMON_WALK_S = 300.0
-# Of a small multicopter that tumbles. Heavier ones fall faster, and wind carries them less far.
+# Terminal speed of a small tumbling multicopter. Heavier ones fall faster and drift less.
 _TERMINAL_M_S = 10.0
 _ROUNDING_M = 1e-6
 
 
 class Margin(NamedTuple):
-    """The least distance, m, and the errors that ask for it, in words."""
+    """The least distance, m, and the errors behind it as text."""
 
     least_m: float
     why: str
 
     def holds(self, distance_m: float) -> bool:
-        """Whether a distance is enough; NaN is not."""
+        """Whether a distance is enough; False for NaN."""
         return distance_m >= self.least_m - _ROUNDING_M
 
     def or_at_least(self, least_m: float, why: str) -> "Margin":
-        """This one, unless something else asks for more."""
+        """This margin, or a larger requirement."""
         return self if self.least_m >= least_m else Margin(least_m, why)
 
     def __str__(self) -> str:
-        # Never a number that would not do.
+        # Rounded up, so that the number is enough.
         return f"must be {math.ceil(100.0 * self.least_m - 1e-6) / 100.0:g} m ({self.why})"
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorBudget(Bounded):
-    """How wrong one vehicle may be at worst, m; `[errors]` of robot.toml.
+    """Worst errors of one vehicle, m; `[errors]` of robot.toml.
 
-    `gps_m`: its estimate's horizontal error. `wind_m`: how far a gust, or control, carries it from
-    where it wants to be, `wind_m_s` the greatest speed of a gust, m/s. `height_apart_m`: by how
-    much two vehicles' estimated heights come to differ in truth in one flight, each above its own
-    pad; `height_common_m`: how far all heights walk together in five minutes, `takeoffs_height_m`
-    how far they do from the first takeoff to the last, since each is 0 when its robot is armed.
-    `height_control_m`: how far from its height it is held. `pads_height_m`: how much higher one pad
-    may lie than another. `drone_m`: its size, propellers and all.
+    `gps_m`: horizontal error of its estimate. `wind_m`: displacement by gusts or control,
+    `wind_m_s`: speed of the strongest gust, m/s. `height_apart_m`: true difference that arises in a
+    flight between equal estimated heights of two vehicles, each above its own pad.
+    `height_common_m`: drift of all heights together in five minutes, `takeoffs_height_m`: the same
+    from the first takeoff to the last, since each height is 0 at arming. `height_control_m`: error
+    of height control. `pads_height_m`: difference of the pads' heights. `drone_m`: size with
+    propellers.
 
     Raises ValueError if one is not finite or below 0 (`drone_m`: not above 0).
     """
@@ -71,28 +71,28 @@ class ErrorBudget(Bounded):
 
     @property
     def position_m(self) -> float:
-        """How far any part of the vehicle may be from the place that it is told, horizontally."""
+        """Largest horizontal distance of any part of the vehicle from its commanded place."""
         return self.gps_m + self.wind_m + self.drone_m / 2.0
 
     def reported_position_m(self, accuracy_m: float | None) -> float:
-        """The same, with the accuracy that its receiver reports; None if it reports none.
+        """The same with the accuracy reported by its receiver, None if it reports none.
 
-        A report that is worse than `gps_m` counts; a better one never does. So a `gps_m` of a
-        receiver with corrections has to be confirmed by the receiver.
+        Only reports worse than `gps_m` count, so a small `gps_m` must be confirmed by a receiver
+        with corrections.
         """
         estimate_m = _UNREPORTED_M if accuracy_m is None else _REPORT_FACTOR * accuracy_m
         return self.position_m + max(estimate_m - self.gps_m, 0.0)
 
     @property
     def takeoffs_window_s(self) -> float:
-        """From the first takeoff to the last of those who fly together, s; inf if nothing walks."""
+        """Longest time from the first to the last takeoff of a flight, s; inf without drift."""
         if self.height_common_m == 0.0:
             return math.inf
         return _COMMON_WALK_S * self.takeoffs_height_m / self.height_common_m
 
     @property
     def slot_spacing(self) -> Margin:
-        """From one robot's height to another's."""
+        """Distance between the heights of two robots."""
         estimates_m = self.height_apart_m + self.takeoffs_height_m
         return Margin(
             estimates_m + 2.0 * self.height_control_m + self.pads_height_m + self.drone_m,
@@ -103,9 +103,9 @@ class ErrorBudget(Bounded):
 
     @property
     def passing_m(self) -> float:
-        """In the plane between two vehicles as estimated, so that in truth they do not touch.
+        """Estimated horizontal distance at which two vehicles do not touch in truth.
 
-        Estimates tell where wind and control carry them, but for their own errors.
+        Estimates include displacements by wind and control.
         """
         return 2.0 * self.gps_m + self.drone_m
 
@@ -117,12 +117,12 @@ class ErrorBudget(Bounded):
 
     @property
     def height_m(self) -> float:
-        """How far one vehicle's height above its own pad may be from what it is told."""
+        """Largest error of one vehicle's height above its own pad relative to its command."""
         return self.height_common_m + self.height_apart_m / 2.0 + self.height_control_m
 
     @property
     def lowest_height(self) -> Margin:
-        """From the ground to a robot's height."""
+        """Distance of a robot's height from the ground."""
         return Margin(
             self.height_m + self.drone_m / 2.0,
             f"heights err by {self.height_common_m:g} m together and {self.height_apart_m / 2.0:g} "
@@ -131,10 +131,10 @@ class ErrorBudget(Bounded):
         )
 
     def fence_buffer(self, limits: MotionLimits, reaction_s: float) -> Margin:
-        """From where robots stop to the fence's line.
+        """Distance between the place where robots stop and the fence's line.
 
-        They are told no speed that they could not stop from before the buffer. What remains is what
-        they fly on when nobody tells them anything, for `reaction_s`, and the wind.
+        Commanded speeds allow a stop before the buffer. The rest is the way flown without commands,
+        for `reaction_s`, and the wind.
         """
         blind_m = limits.max_speed_m_s * reaction_s
         return Margin(
@@ -144,7 +144,7 @@ class ErrorBudget(Bounded):
         )
 
     def px4_fence(self, limits: MotionLimits) -> Margin:
-        """From the fence's line to PX4's own fence, which must not act while ours still can."""
+        """Distance of PX4's own fence from the fence's line, so that it acts only after ours."""
         way_m = stopping_m(limits.max_speed_m_s, limits)
         return Margin(
             way_m + self.wind_m,
@@ -153,12 +153,12 @@ class ErrorBudget(Bounded):
         )
 
     def free_ground(self, limits: MotionLimits, px4_fence_m: float, ceiling_m: float) -> Margin:
-        """Around the fence's line: where nobody may be, whatever fails, in whole m.
+        """Width of the ground around the fence's line that must be free of people, in whole m.
 
-        The vehicle is beyond the line by its position error, runs up to PX4's fence `px4_fence_m`
-        further out, needs its way to stop, and loses its motors just there, at the ceiling and its
-        height error above it. It falls against the air's drag, and is carried all the time at its
-        own greatest speed or the wind's, whichever is greater.
+        The vehicle is beyond the line by its position error, flies to PX4's fence `px4_fence_m`
+        further out, needs its way to stop, and loses its motors there, at the ceiling plus its
+        height error. It falls against the air's drag, and drifts with the greater of its maximum
+        speed and the wind's.
         """
         way_m = stopping_m(limits.max_speed_m_s, limits)
         fall_m = max(limits.max_speed_m_s, self.wind_m_s) * _fall_s(ceiling_m + self.height_m)
@@ -170,14 +170,14 @@ class ErrorBudget(Bounded):
 
 
 def _fall_s(height_m: float) -> float:
-    """How long a fall from rest takes, with drag by the square of the speed."""
+    """Time of a fall from rest, with drag by the square of the speed."""
     scale_s = _TERMINAL_M_S / _GRAVITY_M_S2
-    # arccosh(exp(x)), which does not overflow.
+    # arccosh(exp(x)) without overflow.
     x = height_m / (_TERMINAL_M_S * scale_s)
     return scale_s * (x + math.log1p(math.sqrt(-math.expm1(-2.0 * x))))
 
 
-@functools.lru_cache(maxsize=64)  # asked for several times in each tick of the control loop
+@functools.lru_cache(maxsize=64)  # used several times in each tick of the control loop
 def places_apart(own_m: float, other_m: float) -> Margin:
-    """From one robot's pad or landing point to another's, by the position errors of both."""
+    """Distance between two pads or landing points, from the position errors of both robots."""
     return Margin(own_m + other_m, f"positions err by {own_m:.3g} m and {other_m:.3g} m")

@@ -1,6 +1,6 @@
-"""The operator's orders: where each is taken, and why it is refused.
+"""The operator's orders: states in which each is accepted, and reasons of refusals.
 
-`ORDERS` says it of each kind; docs/safety.md shows the same table to people.
+`ORDERS` has a rule for each kind; docs/safety.md shows the same table.
 """
 
 from collections.abc import Callable, Mapping
@@ -39,12 +39,12 @@ _Check = Callable[[Tick], Refusal | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderRule:
-    """Where one kind of order is taken, and what it does besides the transition that it leads to.
+    """Where one kind of order is accepted, and its effects in addition to its transition.
 
-    Each check says why the order is refused, or None: `first` whatever the state is, `checks` where
-    it is taken. `from_anybody`: who commands, and what was obeyed before, does not matter.
-    `moves_nothing`: it is obeyed even if a transition comes before it. `arms`: the vehicle is then
-    armed in the name of whoever ordered it. `trial`: a mission begins by it, or none has begun.
+    Each check gives a reason of refusal, or None: `first` in any state, `checks` where it is
+    accepted. `from_anybody`: independent of the commander and of earlier orders. `moves_nothing`:
+    obeyed even if another transition comes first. `arms`: the vehicle is armed in the operator's
+    name. `trial`: the order's effect on the mission.
     """
 
     taken_in: tuple[FlightState, ...]
@@ -65,7 +65,7 @@ def _ground_commands(t: Tick) -> Refusal | None:
 
 def _cannot_disarm(t: Tick) -> Refusal | None:
     vehicle = t.inputs.vehicle
-    arming = t.flight.state is _S.ARMING  # It may be armed before that is heard.
+    arming = t.flight.state is _S.ARMING  # it may be armed before that is reported
     if vehicle.armed is False and not arming:
         return Refusal(RefusalCode.NOT_ARMED, "is not armed")
     if t.in_air:
@@ -84,13 +84,13 @@ def _not_ready(t: Tick) -> Refusal | None:
 
 
 def _card_not_good(t: Tick) -> Refusal | None:
-    """The one preflight check that a flight goes on without, and no mission begins without."""
+    """The one preflight check without which a flight goes on, but no mission begins."""
     failed = [c for c in t.inputs.failed_checks or () if c.code is CheckCode.CARD_NOT_GOOD]
     return Refusal(RefusalCode.NOT_READY, texts(failed)) if failed else None
 
 
 def _not_in_place(t: Tick) -> Refusal | None:
-    """Why the mission cannot be flown from here."""
+    """Reason why the mission cannot be flown from here."""
     odometry, height = t.inputs.odometry, t.height_m
     vehicle = t.inputs.vehicle
     if doubtful := position_lost(t) or position_doubtful(t):
@@ -138,7 +138,7 @@ ORDERS: Mapping[OrderKind, OrderRule] = {
         checks=(_ground_commands, _card_not_good, _not_in_place, _cannot_start),
         trial="begins",
     ),
-    # PILOT too, since there it is so already.
+    # Also in PILOT, where it has no effect.
     "pilot": OrderRule(taken_in=(_S.HOLD, _S.MISSION, _S.RETURN, _S.PILOT)),
     "rejoin": OrderRule(taken_in=(_S.PILOT,), checks=(_ground_commands, _not_in_place)),
     "reset": OrderRule(
@@ -151,7 +151,7 @@ ORDERS: Mapping[OrderKind, OrderRule] = {
 
 
 def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order | OrderForm | None:
-    """The tick's order, unless it is another robot's, or was answered before."""
+    """The tick's order, unless it is for another robot or was answered before."""
     order = inputs.order
     if order is None or order.robot_id != robot.robot_id:
         return None
@@ -159,7 +159,7 @@ def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order
 
 
 def refusal(t: Tick, order: Order | OrderForm) -> Refusal | None:
-    """Why the order is refused; None if it is taken."""
+    """Reason of a refusal; None if the order is accepted."""
     if order.boot_nonce != t.robot.boot_nonce:
         return Refusal(RefusalCode.OTHER_START, "meant for another start of this robot's program")
     left_s = order.expires_at_uptime_s - t.inputs.uptime_s
@@ -198,7 +198,7 @@ def refusal(t: Tick, order: Order | OrderForm) -> Refusal | None:
 def answered(
     flight: FlightMemory, order: Order | OrderForm, refused: Refusal | None
 ) -> FlightMemory:
-    """The memory, with the order's answer in it; `refused` is None if it was obeyed."""
+    """The memory with the order's answer; `refused` is None if it was obeyed."""
     answer = OrderResult(order.order_id, refused)
     expiry_s = flight.obeyed_expiry_s
     if refused is None:
@@ -208,7 +208,7 @@ def answered(
 
 
 def obeyed(flight: FlightMemory, order: Order) -> tuple[FlightMemory, bool]:
-    """The memory after an order that was obeyed, and whether its trial is a new one."""
+    """The memory after an obeyed order, and whether its trial is new."""
     rule = ORDERS[order.kind]
     if rule.arms:
         flight = replace(flight, armed_by=order.operator)

@@ -1,4 +1,4 @@
-"""The checks before a takeoff: everything that speaks against it, and what to do about it."""
+"""Preflight checks: all reasons against a takeoff, with remedies."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -29,9 +29,9 @@ _FIX_3D = 3
 
 @dataclass(frozen=True, slots=True)
 class PreflightLimits(Bounded):
-    """How good is good enough; `min_battery` is a share, 0 to 1.
+    """Limits of the checks; `min_battery` is a share, 0 to 1.
 
-    Raises ValueError if a number is not finite or out of its range.
+    Raises ValueError if a number is out of range.
     """
 
     min_battery: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
@@ -46,19 +46,17 @@ class PreflightLimits(Bounded):
 class PreflightInputs:
     """Inputs of the checks.
 
-    `bundle_problem` is why the bundle was not verified on this CPU, None if it was.
-    `system_id` is the configured one. `position` is what the position is worth; `position_m` (3,)
-    and `landing_point_m` (2,) are in the mission frame; the slot's height is above the takeoff
-    point. How far robots must be apart follows from `errors`. `failsafe_problems` come from
-    `failsafe.check`, None until the vehicle's parameters were read. `fence_changed`: the vehicle's
-    fence was the right one, and somebody else has changed it. `neighbours` are the other
-    robots that were heard lately, `not_understood` those who said what cannot be read, `unheard`
-    those that the ground hears and this one does not, `fell_silent` those who did so in flight and
-    may still be in the air, as of their last word; how far to stay from them is in `separation`.
-    `ground_age_s` is how long ago the ground was heard, None if never; the fleet's time is known to
-    `time_uncertainty_s`, None if it is not. `has_answer`: the policy gave one lately.
-    `answer_problem` is what is wrong with what the sensor, or the policy, gave last, "" if that is
-    not known.
+    `bundle_problem` is None if the bundle was verified on this CPU. `system_id` is the configured
+    one. `position` is the judged quality; `position_m` (3,) and `landing_point_m` (2,) are in the
+    mission frame; the slot's height is above the takeoff point. `errors` determine the distances of
+    robots. `failsafe_problems` come from `failsafe.check`, None before the vehicle's parameters
+    were read. `fence_changed`: the vehicle had the right fence, and somebody else changed it.
+    `neighbours` are the robots heard recently, `not_understood` those with unreadable messages,
+    `unheard` those heard by the ground only, `fell_silent` those that fell silent in flight and may
+    still be in the air, as of their last message; `separation` has the distance from them.
+    `ground_age_s` is the age of the ground's last message, None if there was none; the fleet's time
+    is known to `time_uncertainty_s`, None if unknown. `has_answer`: the policy has answered
+    recently. `answer_problem` is the fault of the sensor's or policy's last result, "" if unknown.
     """
 
     now_s: float
@@ -94,9 +92,9 @@ class PreflightInputs:
 
 
 def failed_checks(inputs: PreflightInputs, limits: PreflightLimits) -> tuple[FailedCheck, ...]:
-    """Every check that fails, one plain line each with what to do; empty means ready.
+    """All failed checks, one line each with a remedy; empty means ready.
 
-    What somebody has to do comes first, then what is only to be waited for, and may follow from it.
+    Faults that need action come first, then those that settle, which may be consequences.
     """
     found = (
         *_program(inputs, limits),
@@ -128,7 +126,7 @@ def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[Faile
         known = "not known yet" if error_s is None else f"known to {error_s:.1f} s only"
         text = f"the ground's time is {known}: wait, or check the radio"
         yield FailedCheck(CheckCode.TIME_NOT_KNOWN, text, True)
-    # Without a position there is nothing to look at.
+    # Without a position there is nothing to perceive.
     if inputs.position_m is not None and not inputs.has_answer:
         why = inputs.answer_problem or "wait; if this stays, this robot's log says why"
         text = f"the policy has no fresh answer: {why}"
@@ -138,7 +136,7 @@ def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[Faile
 def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
     vehicle = inputs.vehicle
     if not vehicle.connected:
-        # Whatever was heard before says nothing about now.
+        # State received before says nothing about the present.
         others = ", ".join(map(str, vehicle.other_system_ids))
         if others:
             yield FailedCheck(
@@ -213,7 +211,7 @@ def _arming(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     else:
         for problem in inputs.failsafe_problems:
             yield FailedCheck(CheckCode.FAILSAFE_WRONG, f"autopilot's {problem}")
-    # Without a mission origin there is none to upload, and that is a check of its own.
+    # Without a mission origin there is no fence to upload; that is a check of its own.
     if inputs.fence_changed or not (inputs.fence_uploaded or inputs.origin is None):
         yield FailedCheck(
             CheckCode.FENCE_NOT_UPLOADED,
@@ -377,7 +375,7 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
 
 
 def _may_come_down(inputs: PreflightInputs) -> Iterator[FailedCheck]:
-    """Whether somebody fell silent in flight who may come down where this robot stands."""
+    """Whether a robot that fell silent in flight may come down on this one."""
     if inputs.position_m is None:
         return
     place_m, limits = np.array(inputs.position_m[:2]), inputs.separation.silence
@@ -395,7 +393,7 @@ def _may_come_down(inputs: PreflightInputs) -> Iterator[FailedCheck]:
 
 
 def _too_late(errors: ErrorBudget, others: Sequence[Beacon]) -> Iterator[FailedCheck]:
-    """Whether somebody took off so long ago that heights above the pad mean another height now."""
+    """Whether somebody took off so long ago that its height reference has drifted."""
     armed = [beacon for beacon in others if beacon.armed]
     known = [(s.robot_id, math.inf if s.flown_s is None else s.flown_s) for s in armed]
     robot_id, flown_s = max(known, key=lambda each: each[1], default=(-1, -math.inf))
@@ -406,7 +404,7 @@ def _too_late(errors: ErrorBudget, others: Sequence[Beacon]) -> Iterator[FailedC
             if math.isfinite(flown_s)
             else "since before its program started"
         )
-        # In words that stay the same for as long as it lasts.
+        # A text that stays the same.
         yield FailedCheck(
             CheckCode.TAKEOFFS_TOO_FAR_APART,
             f"robot {robot_id} has been in the air {since}: heights have walked since then; wait "
@@ -415,7 +413,7 @@ def _too_late(errors: ErrorBudget, others: Sequence[Beacon]) -> Iterator[FailedC
 
 
 def _in_the_way(inputs: PreflightInputs, others: Sequence[Beacon]) -> Iterator[FailedCheck]:
-    """Whether somebody stands where this robot would come down."""
+    """Whether a robot stands at this robot's place of landing."""
     frame_id = None if inputs.origin is None else inputs.origin.frame().frame_id
     standing = standing_robots(beacon for beacon in others if beacon.frame_id == frame_id)
     x_m, y_m = inputs.landing_point_m
@@ -430,7 +428,7 @@ def _in_the_way(inputs: PreflightInputs, others: Sequence[Beacon]) -> Iterator[F
 
 
 def _apart(inputs: PreflightInputs, beacon: Beacon, other: str) -> Iterator[FailedCheck]:
-    """Whether two robots stay apart in truth, above each other and where they land."""
+    """Whether two robots stay apart in truth, in height and where they land."""
     errors, gps = inputs.errors, inputs.vehicle.gps
     limit_m = inputs.min_separation_m
     heights = errors.slot_spacing.or_at_least(limit_m, "min_separation_m")

@@ -1,4 +1,4 @@
-"""Limits that no ground can widen: how far and how high a robot may be sent at most."""
+"""Limits of distance and height that no ground can extend."""
 
 import math
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from edge.messages.codes import CheckCode, FailedCheck
 
 @dataclass(frozen=True, slots=True)
 class Reach(Bounded):
-    """The outermost fence: around where the robot stands when it is armed, and above it, m.
+    """The outermost fence, around and above the place where the robot is armed, m.
 
-    The mission origin and every corner of the fence lie within `distance_m` of there, the fence's
+    The mission origin and every corner of the fence are within `distance_m` of it, the fence's
     ceiling within `ceiling_m`. Raises ValueError if one is not finite or not above 0.
     """
 
@@ -21,9 +21,9 @@ class Reach(Bounded):
     ceiling_m: Positive = 120.0
 
     def origin_beyond(self, place_m: Sequence[float] | None) -> FailedCheck | None:
-        """Describe the fault of a mission origin for a robot at this place (x, y) of it.
+        """Fault of a mission origin for a robot at (x, y) relative to it.
 
-        Nothing, as far as is known, if the place is not.
+        None also if the place is unknown.
         """
         if place_m is None:
             return None
@@ -32,14 +32,14 @@ class Reach(Bounded):
         )
 
     def fence_beyond(self, fence: Fence, place_m: Sequence[float] | None) -> FailedCheck | None:
-        """The same of a fence."""
+        """Fault of a fence for a robot at this place."""
         if place_m is None:
             return None
         farthest_m = max(math.dist(corner, place_m[:2]) for corner in fence.vertices_m)
         return self._beyond(CheckCode.FENCE_OUT_OF_REACH, "fence reaches to", farthest_m)
 
     def _beyond(self, code: CheckCode, what: str, away_m: float) -> FailedCheck | None:
-        # NaN is a place that is not known, which preflight refuses by itself.
+        # NaN is an unknown place, which preflight refuses in another check.
         if not away_m > self.distance_m:
             return None
         text = (

@@ -1,7 +1,7 @@
-"""Inputs and results of a control tick, as the flight log holds them.
+"""Inputs and results of control ticks in the flight log.
 
-A message holds what is not as in the one before, exactly; every hundredth holds everything, so that
-a log can be read from the middle. The memory that a tick is given is mostly what the last one made.
+A message has the exact differences from the one before; every hundredth is complete, so that a log
+can be read from the middle. A tick's memory is usually the result of the last one.
 """
 
 from collections.abc import Mapping
@@ -15,17 +15,17 @@ from edge.flight.state import FlightInputs, FlightMemory, Robot
 from edge.flight.step import Decision
 from edge.messages.codes import Reason
 
-# At 10 Hz, every 10 s.
+# Every 10 s at 10 Hz.
 _WHOLE_EVERY = 100
 
 
 class TickError(ValueError):
-    """A message is not that of a tick; the text says why."""
+    """A message is not a valid tick; the text says why."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Given:
-    """All that `step` and `guide` get in one tick."""
+    """All inputs of `step` and `guide` in one tick."""
 
     robot: Robot
     flight: FlightMemory
@@ -36,7 +36,7 @@ class Given:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Made:
-    """Result of a tick. The setpoint is one of the two, in the mission frame, or None."""
+    """Result of a tick. One of the two setpoints is set, in the mission frame, or none."""
 
     flight: FlightMemory
     actions: tuple[Action, ...]
@@ -48,7 +48,7 @@ class Made:
 
 
 def made(decision: Decision, setpoint: MissionSetpoint | None, guidance: Guidance) -> Made:
-    """Record what `step` and `guide` returned."""
+    """Make the record of `step`'s and `guide`'s results."""
     return Made(
         flight=decision.flight,
         actions=decision.actions,
@@ -69,14 +69,14 @@ class FlightTick:
 
 
 class TickWriter:
-    """Makes messages of one program's ticks, in their order."""
+    """Encodes one program's ticks as messages, in order."""
 
     def __init__(self) -> None:
         self._last: FlightTick | None = None
         self._number = 0
 
     def message(self, tick: FlightTick) -> dict[str, Any]:
-        """Of plain values."""
+        """Message of plain values."""
         last = self._last if self._number % _WHOLE_EVERY else None
         given = changes(None if last is None else _left(last), tick.given)
         made = changes(None if last is None else _begun(last, tick.given), tick.made)
@@ -86,14 +86,14 @@ class TickWriter:
 
 
 class TickReader:
-    """Makes the ticks of the messages again."""
+    """Decodes messages into ticks."""
 
     def __init__(self) -> None:
         self._last: FlightTick | None = None
         self._number = -1
 
     def tick(self, message: Mapping[str, Any]) -> FlightTick | None:
-        """None if messages before it are missing. Raises TickError."""
+        """Decode a tick; None if messages before it are missing. Raises TickError."""
         try:
             number, whole = int(message["number"]), bool(message["whole"])
             if not whole and (self._last is None or number != self._number + 1):
@@ -112,10 +112,10 @@ class TickReader:
 
 
 def _left(last: FlightTick) -> Given:
-    """Given to the next tick if nothing changes."""
+    """Inputs of the next tick without changes."""
     return replace(last.given, flight=last.made.flight, guidance=last.made.guidance)
 
 
 def _begun(last: FlightTick, given: Given) -> Made:
-    """Made of this tick if nothing changes."""
+    """Result of this tick without changes."""
     return replace(last.made, flight=given.flight, guidance=given.guidance)

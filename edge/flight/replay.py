@@ -1,7 +1,6 @@
-"""Does a robot decide what it decided in flight? From a flight log's messages alone.
+"""Replays flight decisions from a flight log: does the program decide the same again?
 
-Every tick is run again from what it was given, its memory too: so each difference is one of that
-tick, and what follows from it is not told again and again.
+Each tick is repeated with its logged inputs and memory, so differences do not propagate.
 """
 
 import math
@@ -21,9 +20,9 @@ _REST = tuple(n for n in FlightMemory.__struct_fields__ if n not in ("state", "r
 
 
 class Differing(NamedTuple):
-    """One thing of a tick, such as "state": what it was then, and what it is now, in words.
+    """One differing item of a tick, such as "state", with both values as text.
 
-    `is_rounding`: it is numbers alone, that differ in their last digits.
+    `is_rounding`: only numbers that differ in their last digits.
     """
 
     what: str
@@ -34,7 +33,7 @@ class Differing(NamedTuple):
 
 @dataclass(slots=True)
 class FlightDifference:
-    """Difference in `ticks` ticks in a row, as it was in the first of them."""
+    """A difference in `ticks` ticks in a row, with the values of the first of them."""
 
     since_unix_s: float
     until_unix_s: float
@@ -43,23 +42,23 @@ class FlightDifference:
 
 
 class FlightReplay:
-    """Runs the ticks of a log again, in their order.
+    """Repeats the ticks of a log in order.
 
-    `ticks` were run, of which `differing` differ; `passed_over` could not, since messages before
-    them are missing. `began_unix_s` is when the first one was.
+    `ticks` were repeated, of which `differing` differ; `passed_over` could not be, since messages
+    before them are missing. `began_unix_s` is the time of the first.
     """
 
     def __init__(self, reader: TickReader | None = None) -> None:
-        """`reader` has read what the same program logged before."""
+        """`reader` has read the same program's earlier messages."""
         self.began_unix_s = math.nan
         self.ticks = self.differing = self.passed_over = 0
         self.differences: list[FlightDifference] = []
         self._reader = reader or TickReader()
-        # By what differs: those that the tick before had.
+        # Differences of the last tick by item.
         self._going_on: dict[str, FlightDifference] = {}
 
     def run(self, unix_time_s: float, message: Mapping[str, Any]) -> None:
-        """One message of the topic `flight`. Raises TickError."""
+        """Repeat one message of the topic `flight`. Raises TickError."""
         tick = self._reader.tick(message)
         if tick is None:
             self.passed_over += 1
@@ -81,7 +80,7 @@ class FlightReplay:
 
 
 def differing(tick: FlightTick) -> Iterator[Differing]:
-    """Differences of a tick now; none if all is the same bit by bit."""
+    """Yield the differences of a tick, compared bit by bit."""
     then, now = tick.made, run_again(tick.given)
     for what, one, other in (
         ("state", then.flight.state, now.flight.state),
@@ -101,7 +100,7 @@ def differing(tick: FlightTick) -> Iterator[Differing]:
 
 
 def run_again(given: Given) -> Made:
-    """The tick as it is decided now."""
+    """Decide a tick again."""
     decision = step(given.robot, given.flight, given.inputs)
     setpoint, guidance = guide(
         given.robot, decision.flight, given.inputs, given.guidance, given.dt_s

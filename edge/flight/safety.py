@@ -1,14 +1,14 @@
-"""Limits on what the vehicle is told to do.
+"""Limits of the vehicle's setpoints.
 
 Mission frame: x right, y forward, z up, m, heights above the robot's own takeoff point. Positions
-and velocities are (3,) float64 unless said otherwise.
+and velocities are (3,) float64 unless stated otherwise.
 
-What MISSION and RETURN command passes `limit_speed` and `limit_acceleration` first, then
-`keep_inside`, and `brake` last, which keeps to the fence too: nothing may soften a stop. What HOLD
-commands passes `make_room` alone.
+Commands of MISSION and RETURN pass `limit_speed`, `limit_acceleration`, `keep_inside`, and finally
+`brake`, which also respects the fence: nothing may soften a stop. Commands of HOLD pass only
+`make_room`.
 
-Nothing here raises in flight. A number that is not finite, or beyond 1000 km, is no measurement:
-where one comes in, a velocity goes out as 0, and a point as None.
+No function raises in flight. Numbers that are not finite, or beyond 1000 km, are no measurements:
+for these, velocities become 0 and points None.
 """
 
 import math
@@ -27,23 +27,23 @@ from edge.flight.silence import SilenceLimits, highest_still_m, nearest_on_way_m
 from edge.messages.beacon import Neighbour
 
 _ABSURD = 1e6
-# A slack is used up no faster than in this time: five control periods, which leaves room for the
-# age of the estimate.
+# A slack is used up in no less than this time: five control periods, with room for the estimate's
+# age.
 _SLACK_TIME_S = 0.5
 _RECOVERY_SHARE = 0.5
 _ROUNDING_M_S = 1e-9
 _HEIGHT_GAIN_PER_S = 1.0
-# Slower than any landing (PX4's last metres: 0.7 m/s), faster than a gust moves who holds a height.
+# Slower than any landing (PX4's last metres: 0.7 m/s), faster than gusts move a holding vehicle.
 _PASSING_M_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class MotionLimits(Bounded):
-    """How fast the robot may move, and how its vehicle answers.
+    """Limits of the robot's motion, and its vehicle's response.
 
-    `max_acceleration_m_s2` is at most 0.7 of what the vehicle reaches: it may have to brake and to
-    turn at once. `lag_s` is the measured time constant of its answer to a velocity setpoint: PX4 in
-    offboard mode takes 1.3 s.
+    `max_acceleration_m_s2` is at most 0.7 of the vehicle's, since it may have to brake and turn at
+    the same time. `lag_s` is the measured time constant of its response to a velocity setpoint: PX4
+    in offboard mode takes 1.3 s.
 
     Raises ValueError if one is not finite and above 0 (the lag: at least 0).
     """
@@ -55,13 +55,13 @@ class MotionLimits(Bounded):
 
 
 class SeparationLimits(NamedTuple):
-    """How far to stay from other robots, as estimated, m.
+    """Distances from other robots, as estimated, m.
 
-    `level_m`: from each, by 3-D distance. `passing_m`, in the plane: from one that climbs or comes
-    down through the robot's height, since it keeps to its place and looks for nobody; it has not
-    passed before it is `passing_height_m` away in height. `piloted_m`, in the plane: from one that
-    somebody flies at its height. `landed_m`, in the plane: from where another one comes down,
-    or may come down since it fell silent in flight; `silence` takes it to fly on for a while.
+    `level_m`: 3-D distance from each. `passing_m`, horizontal: from a robot that climbs or descends
+    through this one's height without avoiding others, until it is `passing_height_m` above or
+    below. `piloted_m`, horizontal: from a robot flown by a pilot at this height. `landed_m`,
+    horizontal: from the place where another one lands, or may land after it fell silent in flight;
+    `silence` bounds its flight until then.
     """
 
     level_m: float
@@ -80,9 +80,9 @@ class Closest(NamedTuple):
 
 
 def nearest(position_m: Sequence[float], neighbours: Iterable[Neighbour]) -> Closest | None:
-    """Find the nearest robot, in 3-D, each taken to have flown on as it did; None if there is none.
+    """Nearest robot in 3-D, extrapolated at constant velocity; None if there is none.
 
-    Neighbours of which something is not known are left out.
+    Neighbours with unknown values are left out.
     """
     distances = [
         (neighbour.robot_id, math.dist(_extrapolated(neighbour), position_m))
@@ -95,9 +95,9 @@ def nearest(position_m: Sequence[float], neighbours: Iterable[Neighbour]) -> Clo
 def clear_height_m(
     position_m: F64, neighbours: Iterable[Neighbour], min_separation_m: float
 ) -> float:
-    """How high a robot may climb from here, m: `min_separation_m` below whoever is above it.
+    """Height to which a robot may climb, m: `min_separation_m` below the lowest robot above it.
 
-    Infinite if nobody is. Who is less than twice that distance away in the plane counts as above.
+    Infinite without one. Robots within twice that distance horizontally count as above.
     """
     heights_m = [math.inf]
     for neighbour in filter(_is_known, neighbours):
@@ -109,7 +109,7 @@ def clear_height_m(
 
 
 def limit_speed(velocity: F64, max_speed: float) -> F64:
-    """`velocity` (2,), shortened to `max_speed` if it is longer; the direction stays.
+    """`velocity` (2,), shortened to `max_speed` if it is longer, with the same direction.
 
     A velocity that is not finite becomes 0.
     """
@@ -122,7 +122,7 @@ def limit_speed(velocity: F64, max_speed: float) -> F64:
 def limit_acceleration(
     previous_m_s: F64, wanted_m_s: F64, max_acceleration_m_s2: float, dt_s: float
 ) -> F64:
-    """`wanted_m_s`, or as far on the way to it from `previous_m_s` as `dt_s` allows."""
+    """`wanted_m_s`, or as close to it from `previous_m_s` as `dt_s` allows."""
     if not _plausible(previous_m_s, wanted_m_s, (dt_s,)):
         return np.zeros(3)
     change = wanted_m_s - previous_m_s
@@ -132,7 +132,7 @@ def limit_acceleration(
 
 
 def hold_height(height_m: float, wanted_height_m: float, max_climb_m_s: float) -> float:
-    """The climb rate, m/s, up positive, towards a height: K_p (wanted - height), K_p = 1 / s."""
+    """Climb rate, m/s, up positive, towards a height: K_p (wanted - height), K_p = 1 / s."""
     if not _plausible((height_m, wanted_height_m)):
         return 0.0
     climb_m_s = _HEIGHT_GAIN_PER_S * (wanted_height_m - height_m)
@@ -140,10 +140,10 @@ def hold_height(height_m: float, wanted_height_m: float, max_climb_m_s: float) -
 
 
 def leash(target_m: F64, position_m: F64, length_m: float) -> F64 | None:
-    """`target_m`, or the point towards it that is `length_m` away from the position.
+    """`target_m`, or the point towards it at `length_m` from the position.
 
-    So a position setpoint does not make the vehicle dash when its estimate jumps. None if there is
-    no telling where that is: then command no velocity instead.
+    With this, a position setpoint does not make the vehicle dash when its estimate jumps. None for
+    invalid inputs; then command a velocity of 0 instead.
     """
     if not _plausible(target_m, position_m):
         return None
@@ -153,12 +153,12 @@ def leash(target_m: F64, position_m: F64, length_m: float) -> F64 | None:
 
 
 def stopping_m(speed_m_s: float, limits: MotionLimits) -> float:
-    """The way that it takes to stop from a speed of 0 or more, m: v lag + v^2 / 2a."""
+    """Stopping distance from a speed of 0 or more, m: v lag + v^2 / 2a."""
     return speed_m_s * (limits.lag_s + speed_m_s / (2.0 * limits.max_acceleration_m_s2))
 
 
 def approach_speed(distance_m: float, limits: MotionLimits) -> float:
-    """The largest speed that `distance_m` is enough to stop from; 0 if none."""
+    """The largest speed that allows a stop within `distance_m`; 0 if none."""
     if not 0.0 < distance_m < _ABSURD:
         return 0.0
     lag_s, acceleration = limits.lag_s, limits.max_acceleration_m_s2
@@ -175,10 +175,10 @@ def keep_inside(
 ) -> tuple[F64, bool]:
     """Limit `wanted_m_s` so that the vehicle stops at the buffer inside the line.
 
-    `velocity_m_s` is the vehicle's own, as estimated: for its lag it moves on, whatever is told.
-    Towards each edge the velocity is shortened, along it not. A vehicle that was carried outside is
-    brought back, at half the greatest speed, until it is half the buffer inside: pass the second
-    result in again as `recovering`. Heights stop at the floor and at the ceiling themselves, and
+    `velocity_m_s` is the vehicle's estimate: during its lag it moves on, whatever the command. The
+    velocity towards each edge is shortened, not the one along it. A vehicle that was carried
+    outside comes back at half the maximum speed until it is half the buffer inside: pass the second
+    result as `recovering` in the next call. Heights stop at floor and ceiling in the same way, and
     come back to them. Not for takeoff and landing, which pass through the floor.
     """
     if not _plausible(position_m, velocity_m_s, wanted_m_s):
@@ -188,8 +188,8 @@ def keep_inside(
     depth_m = float(np.minimum.reduce(distances_m))
     recovering = depth_m < 0.0 or (recovering and depth_m < fence.buffer_m / 2.0)
     if recovering:
-        # Downhill on the sum of the squared shortfalls, which is convex: it ends inside, in
-        # corners too.
+        # Gradient descent on the sum of squared shortfalls, which is convex: it ends inside, also
+        # in corners.
         inward = np.maximum(fence.buffer_m - distances_m, 0.0) @ edges.inward
         speed_m_s = _RECOVERY_SHARE * limits.max_speed_m_s
         horizontal = inward * (speed_m_s / max(math.hypot(*inward), 1e-9))
@@ -210,24 +210,23 @@ def brake(
     limits: MotionLimits,
     fence: Fence | None,
 ) -> F64:
-    """Limit `wanted_m_s` so that the robot stays as far from others as it must.
+    """Limit `wanted_m_s` so that the robot keeps its distance from others.
 
-    `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
-    did. One that is `level_m` or more above or below brakes nothing, since robots cross in their
-    height slots, unless it climbs or comes down and passes before the robot could be out of its
-    way, or somebody flies it at about this height. Towards another one the robot may close half the
-    slack, since that one does the same, and all of it towards one that somebody flies. Away from
-    it, it may always fly, and from one that is too near it has to, by half of what is missing: else
-    each error of an estimate would let them close in, and none part them. Who passes does nothing
-    of the kind: the robot leaves all of its way, and by where the vehicle comes to rest, so that it
-    does not turn round under it. Climbing is not limited. Giving way to a neighbour leads over no
-    edge of `fence`; None where there is none to keep to.
+    `velocity_m_s` is the robot's own estimate. Neighbours are extrapolated at constant velocity. A
+    neighbour at least `level_m` above or below has no effect, since robots cross in their height
+    slots, unless it climbs or descends through this height before the robot could leave its way, or
+    a pilot flies it at about this height. The robot may close half the slack to another one, which
+    does the same, and all of it to a piloted one. It may always fly away; from a robot that is too
+    near it must, by half of the missing distance, or estimation errors would only ever reduce
+    distances. A passing robot does not give way, so the robot leaves all of its way, measured from
+    the place where the vehicle comes to rest, so that it does not turn back beneath. Climbing is
+    not limited. Giving way leads over no edge of `fence`; None for no fence.
 
-    Those who are `silent` fell so in flight, and nobody knows whether they fly on, hover or come
-    down. Who is below one, or level with it, leaves where it may be as it leaves who passes: the
-    way from its last place to where it would be if it had flown on as it did.
+    `silent` robots fell silent in flight, and may fly on, hover or come down. A robot below or
+    level with one leaves its possible places as for a passing robot: the way from its last place to
+    its extrapolated one.
 
-    A neighbour of which something is not known stops the robot.
+    A neighbour with an unknown value stops the robot.
     """
     if not _plausible(position_m, velocity_m_s, wanted_m_s):
         return np.zeros(3)
@@ -248,12 +247,11 @@ def make_room(
     *,
     lands: bool,
 ) -> F64:
-    """Limit `wanted_m_s` of a robot that holds its place: as `brake`, but it looks at less.
+    """Limit `wanted_m_s` of a robot that holds its place: like `brake`, with fewer neighbours.
 
-    Neighbours of which something is not known do not keep it from its place; nor do those who are
-    silent, who may not hear it either, and take it to stand there. Who is to come down where it is,
-    as they may be too, `lands`: it parts from each neighbour, whatever its height is, by `landed_m`
-    in the plane, of which each flies half.
+    Neighbours with unknown values are ignored, as are silent ones, which may not hear this robot
+    and expect it to stay. If the robot may soon land here, as its neighbours may (`lands`), it
+    parts from each of them at any height by `landed_m` horizontally, of which each flies half.
     """
     known = [each for each in neighbours if _is_known(each)]
     if not lands:
@@ -262,7 +260,7 @@ def make_room(
     for neighbour in known:
         offset_m = np.array(_extrapolated(neighbour)[:2]) - position_m[:2]
         apart_m = math.hypot(*offset_m)
-        # In a crowd one is left towards another, which leaves in turn.
+        # In a crowd, leaving one robot leads towards another, which leaves in turn.
         at_most_m = max(apart_m - separation.level_m, 0.0) / 2.0
         slack_m = (apart_m - separation.landed_m) / 2.0
         near.append(_Near(offset_m, slack_m, max(slack_m, at_most_m), from_rest=False))
@@ -270,10 +268,10 @@ def make_room(
 
 
 class _Near(NamedTuple):
-    """A robot that limits this one: its place from here, (2,), or from where the vehicle stops.
+    """A robot that limits this one: its offset (2,) from here, or from where the vehicle stops.
 
-    `slack_m` may be flown towards it, below 0 away from it; and no more than `at_most_m`, 0 or
-    more, if others have to be left more than this one.
+    `slack_m` may be flown towards it; below 0, away from it. `at_most_m`, 0 or more, bounds the way
+    towards it while others must be left more urgently.
     """
 
     offset_m: F64
@@ -283,9 +281,9 @@ class _Near(NamedTuple):
 
 
 class _Way(NamedTuple):
-    """The way to a neighbour, (2,), and how fast to be told to fly it, m/s: away if below 0.
+    """Direction (2,) to a neighbour and the largest commanded speed, m/s; below 0, away from it.
 
-    `at_most`, 0 or more, if others have to be left more than this one.
+    `at_most`, 0 or more, applies while others must be left more urgently.
     """
 
     direction: F64
@@ -336,9 +334,9 @@ def _kept_apart(
     limits: MotionLimits,
     fence: Fence | None,
 ) -> F64:
-    """Limit `wanted_m_s` towards, and away from, all robots that are near."""
+    """Limit `wanted_m_s` relative to all near robots."""
     if not all(each.offset_m.any() for each in near):
-        return np.zeros(3)  # One is just here: every way may be the wrong one.
+        return np.zeros(3)  # at the same place: any direction may be wrong
     ways = []
     for offset_m, slack_m, at_most_m, from_rest in near:
         direction = offset_m / math.hypot(*offset_m)
@@ -348,7 +346,7 @@ def _kept_apart(
     horizontal = wanted_m_s[:2]
     if all(float(way.direction @ horizontal) <= way.cap for way in ways):
         return wanted_m_s
-    # Whom it has to leave most has the last word.
+    # The most urgent robot is applied last.
     for way in sorted(ways, key=lambda way: -way.cap):
         if way.cap < 0.0:
             excess = max(float(way.direction @ horizontal) - way.cap, 0.0)
@@ -366,7 +364,7 @@ def _kept_apart(
 def _to_leave(
     offset_m: F64, least_m: float, separation: SeparationLimits, *, from_rest: bool
 ) -> _Near:
-    """One that does nothing for the distance of `least_m` itself."""
+    """A robot that does not keep the distance `least_m` itself."""
     apart_m = math.hypot(*offset_m)
     slack_m = apart_m - least_m
     at_most_m = slack_m if slack_m >= 0.0 else max(apart_m - separation.level_m, 0.0)
@@ -376,7 +374,7 @@ def _to_leave(
 def _passes(
     up_m: float, climb_m_s: float, separation: SeparationLimits, limits: MotionLimits
 ) -> bool:
-    """Whether who is `up_m` higher is at the robot's height before that has left its way."""
+    """Whether a robot `up_m` higher reaches this height before this robot has left its way."""
     if abs(climb_m_s) < _PASSING_M_S:
         return False
     to_leave_s = limits.lag_s + separation.passing_m / limits.max_speed_m_s
@@ -386,28 +384,28 @@ def _passes(
 
 
 def _speed_to(slack_m: float, speed_m_s: float, limits: MotionLimits) -> float:
-    """How fast to be told to fly to a line, and back if it is passed, already doing `speed_m_s`."""
+    """Commanded speed towards a line, or back if it is passed, at the present speed `speed_m_s`."""
     if slack_m >= 0.0:
         return _speed_towards(slack_m, speed_m_s, limits)
     return -_speed_towards(-slack_m, -speed_m_s, limits)
 
 
 def _extrapolated(neighbour: Neighbour) -> Vector:
-    """Where it is now, if it has flown on as it did."""
+    """Present position, extrapolated at constant velocity."""
     (x_m, y_m, z_m), age_s = neighbour.position_m, neighbour.age_s
     x_m_s, y_m_s, z_m_s = neighbour.velocity_m_s
     return x_m + x_m_s * age_s, y_m + y_m_s * age_s, z_m + z_m_s * age_s
 
 
 def _is_known(neighbour: Neighbour) -> bool:
-    """Whether its numbers are plausible: NaN and infinity are not."""
+    """Whether its numbers are plausible; False for NaN and infinity."""
     return math.hypot(*neighbour.position_m, *neighbour.velocity_m_s, neighbour.age_s) < _ABSURD
 
 
 def _caps_at_edges(
     fence: Fence, position_m: F64, velocity_m_s: F64, limits: MotionLimits
 ) -> list[float]:
-    """How fast to be told to fly outwards at each edge."""
+    """Largest commanded outward speed at each edge."""
     edges = fence.edges()
     slacks_m = edges.distances_m(position_m[:2]) - fence.buffer_m
     outward_m_s = -(edges.inward @ velocity_m_s[:2])
@@ -418,11 +416,11 @@ def _caps_at_edges(
 
 
 def _speed_towards(slack_m: float, speed_m_s: float, limits: MotionLimits) -> float:
-    """How fast to be told to fly towards a line `slack_m` away, already doing `speed_m_s`.
+    """Commanded speed towards a line `slack_m` away, at the present speed `speed_m_s`.
 
-    `approach_speed` alone is overshot by a third of the way: the vehicle follows a falling command
-    late. What the slack leaves after the way that it needs to stop falls by itself no faster than
-    by what is commanded, and never below 0 if that is a small part of it.
+    `approach_speed` alone overshoots by a third of the way, since the vehicle follows a falling
+    command late. The slack beyond the stopping distance shrinks no faster than by the commanded
+    speed, and never below 0 if that uses up a small part of it.
     """
     left_m = slack_m - stopping_m(max(speed_m_s, 0.0), limits)
     return min(approach_speed(slack_m, limits), max(left_m, 0.0) / _SLACK_TIME_S)
@@ -434,7 +432,7 @@ def _limit_towards(velocity: F64, directions: Iterable[F64], caps: Sequence[floa
     pairs = list(zip(directions, caps, strict=True))
     for direction, cap in pairs:
         limited = limited - direction * max(float(direction @ limited) - cap, 0.0)
-    # Where directions oppose each other, mending one breaks another: the whole vector gives way.
+    # With opposing directions, fixing one breaks another: shorten the whole vector.
     share = 1.0
     for direction, cap in pairs:
         speed = float(direction @ limited)

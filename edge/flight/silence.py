@@ -1,7 +1,6 @@
-"""Robots that fell silent in flight, and where they may be by now. Mission frame, m and s; pure.
+"""Robots that fell silent in flight, and their possible places. Mission frame, m and s; pure.
 
-Nobody knows whether it flies on, hovers or comes down: its program may have died, its radio, or its
-position.
+Such a robot may fly on, hover or come down: its program, radio or position may have failed.
 """
 
 import math
@@ -13,20 +12,20 @@ from edge.core import F64
 from edge.messages.beacon import Beacon, Neighbour
 from edge.messages.mission import FlightState
 
-# Slower than any landing of PX4's, whose last metres take 0.7 m/s.
+# Slower than any landing of PX4, whose last metres take 0.7 m/s.
 _COMES_DOWN_M_S = 0.5
 _APART_M = 2.0
-# On a mission it may turn: of 48 simulated robots nine in ten stopped within 2.2 m of the way that
-# they were taken to fly on, of up to 5.9 m, and all within 3.0 m.
+# It may turn on a mission: of 48 simulated robots 90 % stopped within 2.2 m of the extrapolated way
+# of up to 5.9 m, and all within 3.0 m.
 _STRAYS_SHARE = 0.5
 _CLIMBS = (FlightState.ARMING, FlightState.TAKEOFF, FlightState.RETURN)
 
 
 class SilenceLimits(NamedTuple):
-    """Limits of a robot that fell silent in flight, as long as nobody else flies it.
+    """Limits of a robot that fell silent in flight, while nobody else flies it.
 
-    It is no faster than `max_speed_m_s` and no higher than `ceiling_m`, whatever it told. It flies
-    on for at most `flies_on_s`, and comes down at any time, but after at most `hovers_s`.
+    It is no faster than `max_speed_m_s` and no higher than `ceiling_m`, whatever it sent. It flies
+    on for at most `flies_on_s`, and comes down at any time, after at most `hovers_s`.
     """
 
     max_speed_m_s: float
@@ -36,7 +35,7 @@ class SilenceLimits(NamedTuple):
 
 
 def last_word(beacon: Beacon, limits: SilenceLimits) -> Neighbour | None:
-    """Where it flies, at its own height if it is to climb there; None if it tells no place."""
+    """Its last place, at its own height if it climbs there; None without a place."""
     if not beacon.armed or beacon.position_m is None or beacon.velocity_m_s is None:
         return None
     x_m, y_m, height_m = beacon.position_m
@@ -53,20 +52,20 @@ def last_word(beacon: Beacon, limits: SilenceLimits) -> Neighbour | None:
 
 
 def highest_still_m(silent: Neighbour, limits: SilenceLimits) -> float:
-    """How high it may still be; 0 or less: it is down."""
+    """Its greatest possible height; 0 or less if it is down."""
     comes_down_s = max(silent.age_s - limits.hovers_s, 0.0)
     return silent.position_m[2] - _COMES_DOWN_M_S * comes_down_s
 
 
 def stops_m(silent: Neighbour, limits: SilenceLimits) -> F64:
-    """(n, 2): where it may have stopped, if it flew straight on; at most 2 m from each other."""
+    """Its possible places (n, 2) on a straight way, at most 2 m apart."""
     first_m, along_m = _way_m(silent, limits)
     count = math.ceil(math.hypot(*along_m) / _APART_M) + 1
     return first_m + np.linspace(0.0, 1.0, count)[:, None] * along_m
 
 
 def nearest_on_way_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> F64:
-    """Of all places where it may have stopped, the one that is nearest to a place, (2,)."""
+    """The nearest of its possible places to a place, (2,)."""
     first_m, along_m = _way_m(silent, limits)
     square = float(along_m @ along_m)
     share = float((place_m - first_m) @ along_m) / square if square > 0.0 else 0.0
@@ -74,12 +73,12 @@ def nearest_on_way_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> 
 
 
 def strays_m(silent: Neighbour, limits: SilenceLimits) -> float:
-    """How far beside that way it may have stopped."""
+    """Largest distance beside that way."""
     _, along_m = _way_m(silent, limits)
     return _STRAYS_SHARE * math.hypot(*along_m)
 
 
 def _way_m(silent: Neighbour, limits: SilenceLimits) -> tuple[F64, F64]:
-    """Where it begins, and where it leads from there, (2,) each."""
+    """Begin and vector of the way, (2,) each."""
     on_s = min(silent.age_s, limits.flies_on_s)
     return np.array(silent.position_m[:2]), np.array(silent.velocity_m_s[:2]) * on_s

@@ -1,10 +1,10 @@
-"""The flight state machine of one robot: its parameters, memory, and a tick's inputs.
+"""Flight state machine of one robot: parameters, memory, and a tick's inputs.
 
-`Tick` is all of that together, with what follows from it; the table of transitions, the orders and
-the alarms ask nothing else. Nothing here has a clock or talks to a vehicle.
+`Tick` combines them, with derived values; transitions, orders and alarms use nothing else. No clock
+or vehicle is used.
 
-Heights are above the robot's own takeoff point, which is latched when it is armed (`datum_m`): the
-estimator's zero is not the pad.
+Heights are above the robot's own takeoff point, latched at arming (`datum_m`): the estimator's zero
+is not the pad.
 """
 
 import math
@@ -40,23 +40,23 @@ from edge.messages.mission import (
     SlotNumber,
 )
 
-# How long the autopilot may take to go to offboard.
+# Time for the autopilot to enter offboard.
 OFFBOARD_TIMEOUT_S = 4.0
-# What was true before a lapse or a command is told no later: PX4 tells its mode at 1 Hz.
+# Telemetry from before a lapse or a command arrives no later: PX4 sends its mode at 1 Hz.
 STALE_TELEMETRY_S = 2.0
 _LAPSE_SHARE = 0.9
-# From when a vehicle is to land to when it comes down, at the latest.
+# Longest time from the decision to land to the landing's begin.
 _LANDS_WITHIN_S = 6.0
 _STARTED = Reason(ReasonCode.PROGRAM_STARTED, "program started")
 
-# Who has it land: the ground, a return that came home, or what cannot wait.
+# Origin of a landing: the ground, the end of a return, or an emergency.
 LandBy = Literal["ground", "return", "safety"]
 RemoteControlLost = Literal["alarm", "hold", "land"]
 _BatteryShare = Annotated[float, Meta(gt=0.0, lt=1.0)]
 
 
 class Px4Change(NamedTuple):
-    """Change in flight, by somebody else, of parameters or fence that preflight had found right.
+    """A change in flight, by somebody else, of parameters or fence that preflight had accepted.
 
     `stays`: it could not be set back.
     """
@@ -70,10 +70,10 @@ class FlightParameters(Bounded):
     """Parameters of one robot's flight; times in s, distances in m, speeds in m/s.
 
     The robot flies at `base_height_m + slot * slot_spacing_m`: the policy is planar and GPS errs by
-    metres, so that each robot has a height of its own. `landing_point_m` (x, y) is in the mission
-    frame. `battery_low` and `battery_critical` are remaining shares.
+    metres, so each robot has its own height. `landing_point_m` (x, y) is in the mission frame.
+    `battery_low` and `battery_critical` are remaining shares.
 
-    Raises ValueError that names what is impossible.
+    Raises ValueError that names the impossible value.
     """
 
     slot: SlotNumber
@@ -108,21 +108,20 @@ class FlightParameters(Bounded):
 
 
 class FlightMemory(Struct, frozen=True):
-    """Memory of the machine from tick to tick.
+    """Memory of the state machine from tick to tick.
 
-    `target_m` is what TAKEOFF and HOLD keep: x and y of the mission frame, and a height.
-    `reached`: since the state was entered the vehicle was seen as the state needs it: in offboard,
-    in LAND landing, in FAULT disarmed. `alarming`: the operator must see `reason`.
-    After a lapse of the control loop nothing is sent before `silent_until_s`, which stays set until
-    the vehicle is in offboard again. `failsafe_at_s` is when the autopilot's own failsafe was last
-    seen to act, `remote_control_at_s` when the remote control was last heard, `ground_at_s` when
-    the ground was last not lost. `alone_since_s` is set while the vehicle hovers for no reason that
-    anybody gave: since when nobody has answered.
-    `gps_ignored`: this program had the estimator go without the receiver, and has to set that back.
-    `armed_by` is whose takeoff order this program armed it by, `disarmed_at_s` when the vehicle was
-    last known to be disarmed.
-    `obeyed_expiry_s` is the last obeyed order's, `trial` the mission that was started last.
-    `lift` is whether it holds its height, and whether it stands on the ground.
+    `target_m` is the target of TAKEOFF and HOLD: x and y of the mission frame, and a height.
+    `reached`: since the state's begin the vehicle was seen as required: in offboard; in LAND
+    landing; in FAULT disarmed. `alarming`: the operator must see `reason`. After a lapse of the
+    control loop nothing is sent before `silent_until_s`, which stays set until the vehicle is in
+    offboard again. `failsafe_at_s` is when the autopilot's failsafe last acted,
+    `remote_control_at_s` when the remote control was last heard, `ground_at_s` when the ground was
+    last not lost. `alone_since_s` is set while the vehicle hovers without anybody's command: since
+    when nobody has answered. `gps_ignored`: this program made the estimator ignore the receiver,
+    and must set that back. `armed_by` is the operator of the takeoff order by which this program
+    armed it, `disarmed_at_s` when the vehicle was last known to be disarmed. `obeyed_expiry_s` is
+    the last obeyed order's, `trial` the last started mission. `lift` is the detector of a lost
+    height and of the ground.
     """
 
     state: FlightState = FlightState.INIT
@@ -157,18 +156,17 @@ class FlightMemory(Struct, frozen=True):
 class FlightInputs:
     """Inputs of one control tick.
 
-    `position` is what the position is worth. `odometry` is in the mission frame, its z the altitude
-    above sea level, less what that jumped in flight; None when the position is lost or old, or
-    there is no mission origin. `policy_velocity_m_s` (2,) is None when the policy has no fresh
-    answer; `policy_problem` is what is known of why, or "". `neighbours` are heard, and `closest`
-    is the nearest of them. `busy_neighbours` say of themselves that they arm or take off.
-    `safety_form` is what a ground asks whose states are not understood. `failed_checks` are
-    preflight's; None before the first. `not_taken` is what of the ground's state the robot does not
-    fly by. `order` is new in this tick; of one that is not understood there is the form. `energy`
-    is None when the battery is not known. `lands_beside_m` (2,) is where it comes down since
-    another robot stands at its landing point; None: there. `fell_silent` are those who did so in
-    flight and may still be in the air, as of their last word. `px4_change` is None as long as PX4
-    keeps to what preflight found.
+    `position` is the judged quality. `odometry` is in the mission frame, with z the altitude above
+    sea level without its jumps in flight; None when the position is lost or old, or without a
+    mission origin. `policy_velocity_m_s` (2,) is None without a fresh answer of the policy;
+    `policy_problem` is the known cause, or "". `neighbours` are those heard, `closest` the nearest
+    of them. `busy_neighbours` report that they arm or take off. `safety_form` is the request of a
+    ground whose states are not understood. `failed_checks` are preflight's; None before the first.
+    `not_taken` are parts of the ground's state that the robot does not use. `order` is new in this
+    tick, or the form of one that is not understood. `energy` is None if the battery is unknown.
+    `lands_beside_m` (2,) is the place of landing if another robot stands at the landing point.
+    `fell_silent` are robots that fell silent in flight and may still be in the air, as of their
+    last message. `px4_change` is None while PX4 is as preflight found it.
     """
 
     now_s: float
@@ -195,12 +193,12 @@ class FlightInputs:
 
 @dataclass(frozen=True)
 class Robot:
-    """The robot that flies: what does not change during a flight.
+    """The robot in flight: everything that is constant during a flight.
 
-    `on_remote_control_lost`: what a lost remote control does in flight; None if there is none.
+    `on_remote_control_lost` is the action on a lost remote control in flight; None without one.
 
-    Raises ValueError if the fence leaves no way to the robot's height or to its landing point, or
-    less room for errors than the budget asks for, or is higher than the robot's reach.
+    Raises ValueError if the fence excludes the robot's height or landing point, has less room for
+    errors than the budget requires, or is higher than the robot's reach.
     """
 
     robot_id: int
@@ -245,16 +243,16 @@ class Robot:
 
     @cached_property
     def separation(self) -> SeparationLimits:
-        """How far it stays from the others, who err as it does and fly by the same parameters."""
+        """Distances from others, which have the same errors and parameters."""
         p, errors = self.parameters, self.errors
         passing_m = max(errors.passing_m, p.min_separation_m)
         return SeparationLimits(
             level_m=p.min_separation_m,
             passing_m=passing_m,
             passing_height_m=errors.passing_height_m,
-            # Nobody tells where a pilot carries it next.
+            # A pilot's next movement is unknown.
             piloted_m=passing_m + errors.wind_m,
-            # As from who stands on the ground: both may be off the place where they are to be.
+            # As from a robot on the ground: both may be off their places.
             landed_m=max(
                 places_apart(errors.position_m, errors.position_m).least_m, p.min_separation_m
             ),
@@ -265,7 +263,7 @@ class Robot:
     def silence(self) -> SilenceLimits:
         """Limits of another robot that fell silent."""
         p, limits = self.parameters, self.limits
-        # By where it flies after that, at its greatest speed, when it is to hold.
+        # Way until it stops from its greatest speed, once it is to hold.
         stops_s = stopping_m(limits.max_speed_m_s, limits) / limits.max_speed_m_s
         lands_after_s = max(p.hover_land_s, p.ground_timeout_s + p.ground_lost_land_s)
         return SilenceLimits(
@@ -276,13 +274,13 @@ class Robot:
         )
 
     def told(self, ground: GroundState) -> tuple[Fence, Place]:
-        """Fence and place that the ground gives it, or else its own."""
+        """Fence and place from the ground's state, by default its own."""
         fence = self.fence if ground.fence is None else ground.fence
         place = ground.places.get(str(self.robot_id))
         return fence, self.place if place is None else place
 
     def assigned(self, ground: GroundState) -> "Robot":
-        """The same with those. Raises ValueError, which the operator reads, if they do not fit."""
+        """The robot with these. Raises ValueError, for the operator, if they do not fit."""
         fence, place = self.told(ground)
         try:
             parameters = replace(
@@ -295,7 +293,7 @@ class Robot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """Memory and inputs together, and what follows from them."""
+    """Memory and inputs together, with derived values."""
 
     robot: Robot
     flight: FlightMemory
@@ -303,7 +301,7 @@ class Tick:
 
     @property
     def comes_down_m(self) -> tuple[float, ...]:
-        """Where RETURN leads, (2,): the landing point, or beside it."""
+        """Destination of RETURN, (2,): the landing point, or beside it."""
         return self.inputs.lands_beside_m or self.robot.parameters.landing_point_m
 
     @property
@@ -341,14 +339,14 @@ class Tick:
 
     @property
     def wanted_height_m(self) -> float | None:
-        """The height that it is told to keep or to reach; None if there is none."""
+        """The commanded height; None if there is none."""
         if self.flight.state in (FlightState.MISSION, FlightState.RETURN):
             return self.robot.parameters.slot_height_m
         return None if self.flight.target_m is None else self.flight.target_m[2]
 
     @property
     def off_height_s(self) -> float:
-        """For how long it has been known not to hold its height, s; below 0 if it is not."""
+        """Time for which the height has been lost, s; below 0 if it is not."""
         return self.flight.lift.off_s(self.inputs.now_s)
 
     @property
@@ -362,23 +360,23 @@ class Tick:
 
     @property
     def lapse_s(self) -> float:
-        """How long the control loop was silent; 0 if it was not, or has just begun."""
+        """Duration of the control loop's last silence; 0 without one, or in the first tick."""
         silence_s = self.inputs.now_s - self.flight.tick_at_s
         return silence_s if exceeds_silence(self.robot, silence_s) else 0.0
 
     @property
     def acts_from_s(self) -> float:
-        """From when on the state's setpoints and commands are sent."""
+        """Time from which the state's setpoints and commands are sent."""
         return max(self.flight.since_s, self.flight.silent_until_s)
 
     @property
     def could_follow_s(self) -> float:
-        """For how long the autopilot has been able to go to offboard."""
+        """Time for which the autopilot could have entered offboard."""
         return self.inputs.now_s - max(self.acts_from_s, self.flight.failsafe_at_s)
 
     @property
     def overdue(self) -> bool:
-        """Whether the autopilot had its time to go to offboard."""
+        """Whether the autopilot has had enough time to enter offboard."""
         return self.could_follow_s > OFFBOARD_TIMEOUT_S
 
     @property
@@ -394,28 +392,28 @@ def height_m(flight: FlightMemory, odometry: Odometry | None) -> float | None:
 
 
 def in_air(flight: FlightMemory, vehicle: VehicleState, now_s: float) -> bool | None:
-    """Whether the vehicle is; None when unknown. One that stands is not, whatever PX4 says."""
+    """Whether the vehicle is in the air; None if unknown. Standing overrides PX4's report."""
     return False if flight.lift.stands(now_s) else vehicle.in_air
 
 
 def flown_s(flight: FlightMemory, vehicle: VehicleState, now_s: float) -> float | None:
-    """How long ago the vehicle was armed, s; None if it is not, or was so before this program."""
+    """Time since arming, s; None if disarmed, or armed before this program started."""
     since_s = now_s - flight.disarmed_at_s
     return since_s if vehicle.armed and math.isfinite(since_s) else None
 
 
 def failsafe_acts(vehicle: VehicleState) -> bool:
-    """Whether the autopilot's own failsafe has the vehicle: who asks for another mode ends it.
+    """Whether the autopilot's failsafe has control; a request for another mode would end that.
 
-    PX4 v1.14 calls a warning a failsafe, too: then it still does what it is told in offboard.
+    PX4 v1.14 also reports warnings as failsafe, while it still follows commands in offboard.
     """
     return vehicle.failsafe is True and vehicle.mode not in (Mode.OFFBOARD, *PILOTED)
 
 
 def exceeds_silence(robot: Robot, silence_s: float) -> bool:
-    """Whether the control loop was silent for too long; not if it has just begun, with inf.
+    """Whether the control loop was silent for too long; not for inf, in the first tick.
 
-    A little before the watchdog counts, so that what it does is never taken for a pilot's.
+    This is slightly before the watchdog acts, so that its action is never mistaken for a pilot's.
     """
     return _LAPSE_SHARE * robot.parameters.command_timeout_s < silence_s < math.inf
 

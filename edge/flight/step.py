@@ -1,4 +1,4 @@
-"""One control tick of the flight state machine: memory and inputs -> memory, and what to ask.
+"""One control tick of the flight state machine: memory and inputs -> memory and requests.
 
 Pure: the caller has the clock, and commands the autopilot.
 """
@@ -29,18 +29,18 @@ from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, Ord
 _S = FlightState
 ROWS = by_state(TRANSITIONS)
 
-# PX4 wants a setpoint stream before offboard, and earlier commands are carried out meanwhile.
+# PX4 needs a setpoint stream before offboard, and executes earlier commands meanwhile.
 _STREAM_S = 0.5
 _ASK_AGAIN_S = 1.0
 _LANDED_DISARM_S = 3.0
-# A return climbs at half the speed that it is told at least.
+# A return climbs with at least this share of the commanded speed.
 _CLIMBS_SHARE = 0.5
 
 
 class Decision(NamedTuple):
-    """A tick's outcome; `new_trial`: the explored map and the mailbox are to be forgotten.
+    """A tick's outcome; `new_trial`: the explored map and the mailbox must be cleared.
 
-    `taken` is the row of `TRANSITIONS` that led to the state, None if it stays.
+    `taken` is the applied row of `TRANSITIONS`, None if the state stays.
     """
 
     flight: FlightMemory
@@ -51,7 +51,7 @@ class Decision(NamedTuple):
 
 
 def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
-    """One control tick: at most one transition, and what to ask of the autopilot now."""
+    """One control tick: at most one transition, and requests to the autopilot."""
     flight = _look(Tick(robot, flight, inputs))
     order = new_order(robot, flight, inputs)
     tick = Tick(robot, flight, inputs)
@@ -60,7 +60,7 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
     row, reason = _first_row(tick, None if taken is None else taken.kind)
     overruled = row is not None and row.order is None
     if taken is not None and overruled and not ORDERS[taken.kind].moves_nothing:
-        # Something graver came first.
+        # A more severe transition came first.
         taken, refused = None, Refusal(RefusalCode.OVERRULED, reason)
     actions: tuple[Action, ...] = ()
     if row is not None:
@@ -85,7 +85,7 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
 
 
 def _look(t: Tick) -> FlightMemory:
-    """The memory, with what this tick's inputs add to it, before any transition."""
+    """Update the memory from this tick's inputs, before any transition."""
     flight, inputs, now_s = t.flight, t.inputs, t.inputs.now_s
     vehicle = inputs.vehicle
     if t.lapse_s > 0.0:
@@ -108,9 +108,9 @@ def _look(t: Tick) -> FlightMemory:
     if failsafe_acts(vehicle):
         flight = replace(flight, failsafe_at_s=now_s)
         if flight.state is _S.LAND and flight.reached and vehicle.mode is not Mode.LAND:
-            # PX4 goes on landing by itself; if it does not, it is asked again.
+            # PX4 continues to land; if it does not, it is requested again.
             flight = replace(flight, reached=False, asked_at_s=now_s)
-    # What was on its way when arming was called off has arrived by then.
+    # Telemetry from before arming was called off has arrived by then.
     looked = vehicle.heartbeat_at_s > flight.since_s + STALE_TELEMETRY_S
     if disarmed and flight.state in ON_GROUND and looked:
         flight = _with(flight, armed_by="")
@@ -124,7 +124,7 @@ def _lift(t: Tick) -> Lift:
     flight, inputs, odometry = t.flight, t.inputs, t.inputs.odometry
     if flight.state not in AIRBORNE:
         return Lift()
-    # Beneath somebody who hovers above it, a takeoff waits.
+    # A takeoff waits below a robot that hovers above it.
     climbs_m_s = 0.0 if flight.state is _S.TAKEOFF else _CLIMBS_SHARE * t.robot.limits.max_climb_m_s
     motion = Motion(
         height_m=t.height_m,
@@ -139,7 +139,7 @@ def _lift(t: Tick) -> Lift:
 
 
 def _with(flight: FlightMemory, **changes: Any) -> FlightMemory:
-    """The memory with these fields; itself if they are so already, as they mostly are."""
+    """Replace fields; returns the same memory if nothing changes, the usual case."""
     for name, value in changes.items():
         if getattr(flight, name) != value:
             return replace(flight, **changes)
@@ -172,7 +172,7 @@ def _first_row(tick: Tick, ordered: OrderKind | None) -> tuple[Transition | None
 
 
 def enter(row: Transition, reason: str, t: Tick) -> FlightMemory:
-    """The memory with which the row's target begins; `reason` in words."""
+    """The memory at the begin of the row's target; `reason` is its text."""
     flight, now_s = t.flight, t.inputs.now_s
     from_offboard = flight.state in (_S.ARMING, *STEERED)
     stays_offboard = from_offboard and row.target in STEERED and not row.looks_anew
@@ -215,7 +215,7 @@ def _datum_m(target: FlightState, t: Tick) -> float | None:
 
 
 def _home_m(inputs: FlightInputs) -> float | None:
-    """For a program that starts in flight, the takeoff point is where the vehicle was armed."""
+    """Takeoff point of a program that starts in flight: the place of arming."""
     odometry, above_home_m = inputs.odometry, inputs.vehicle.height_above_home_m
     if odometry is None or above_home_m is None:
         return None
@@ -223,19 +223,19 @@ def _home_m(inputs: FlightInputs) -> float | None:
 
 
 def _target_m(t: Tick) -> Vector | None:
-    """Above the takeoff point, or where the vehicle was when it could be told to stay there."""
+    """Target above the takeoff point, or at the place where the vehicle could first hold."""
     odometry, height, state = t.inputs.odometry, t.height_m, t.flight.state
     if state not in (_S.TAKEOFF, _S.HOLD):
         return None
     target_m = t.flight.target_m
     if odometry is None or height is None:
         return target_m
-    # Nobody, or PX4's own failsafe, steered it meanwhile.
+    # PX4's failsafe, or nothing, steered it in between.
     led_away = t.silent or t.failsafe_acts
     if target_m is not None and t.knows_place and not led_away:
         return target_m
     fence = t.robot.fence
-    # While the position is in doubt, numbers that were good before may be another place now.
+    # While the position is in doubt, the old numbers may be another place.
     x_m, y_m = fence.moved_inside_m(*odometry.position_m[:2], fence.buffer_m / 2.0)
     if state is _S.TAKEOFF:
         return x_m, y_m, t.robot.parameters.slot_height_m
@@ -243,7 +243,7 @@ def _target_m(t: Tick) -> Vector | None:
 
 
 def _ask(t: Tick) -> tuple[Action, ...]:
-    """Commands that the state needs from the autopilot, until it is so; ARM is asked once."""
+    """Commands that the state requires, repeated until done; ARM is requested once."""
     flight, now_s = t.flight, t.inputs.now_s
     streamed = t.could_follow_s >= _STREAM_S
     if flight.state is _S.LAND:
@@ -259,11 +259,11 @@ def _ask(t: Tick) -> tuple[Action, ...]:
     if flight.state is _S.ARMING and flight.reached:
         return () if flight.armed_asked else (Action.ARM,)
     if flight.state in ON_GROUND and t.inputs.vehicle.armed is False:
-        # Where a flight leaves PX4, it would not arm again.
+        # PX4 would not arm again in the mode at the end of a flight.
         stuck = t.heard_since_entry and t.mode in (Mode.OFFBOARD, Mode.LAND, Mode.RETURN)
         return _again(t, Action.HOLD) if stuck else ()
     if t.silent and flight.state in STEERED:
-        # Without setpoints it would land. Before a look, a pilot may have it.
+        # Without setpoints it would land. Before telemetry, a pilot may have it.
         flies_on = t.mode is Mode.OFFBOARD and t.heard_since_entry
         return _again(t, Action.HOLD) if flies_on else ()
     if flight.state in (_S.ARMING, *STEERED) and streamed and not flight.reached:
@@ -272,10 +272,10 @@ def _ask(t: Tick) -> tuple[Action, ...]:
 
 
 def _ask_of_gps(t: Tick) -> tuple[Action, ...]:
-    """Have the estimator go without a receiver that contradicts itself, while it does.
+    """Make the estimator ignore a receiver while that contradicts itself.
 
-    Then PX4 keeps its place by its other sensors for seconds, and its height after that. What is
-    set back is what this program has set: another one may want no receiver on purpose.
+    PX4 then keeps its place by its other sensors for seconds, and its height after that. Only this
+    program's own setting is set back: others may ignore the receiver on purpose.
     """
     vehicle = t.inputs.vehicle
     if t.silent or not vehicle.connected:
@@ -290,6 +290,6 @@ def _again(t: Tick, action: Action) -> tuple[Action, ...]:
     asked_at_s = t.flight.asked_at_s
     if t.inputs.now_s - asked_at_s < _ASK_AGAIN_S:
         return ()
-    # A mode is asked for again only after a look: a pilot may have taken the vehicle in between.
+    # Modes are requested again only after telemetry: a pilot may have taken the vehicle.
     looked = t.inputs.vehicle.heartbeat_at_s > asked_at_s + _STREAM_S
     return (action,) if looked or action in (Action.DISARM, Action.KILL) else ()

@@ -1,8 +1,7 @@
-"""The flight state machine as a table: which state leads to which, when, and what that does.
+"""The flight state machine as a table: transitions, their conditions and effects.
 
-`TRANSITIONS` is the machine, gravest first: in every tick the first row that applies is taken. A
-row says all that it does, so that nothing else asks which row it was. docs/safety.md shows the same
-table to people.
+`TRANSITIONS` is sorted by severity: in each tick the first row that applies is taken. A row has all
+of its effects, so no other code depends on which row it was. docs/safety.md shows the same table.
 """
 
 import math
@@ -35,23 +34,22 @@ _ARMING_TIMEOUT_S = 6.0
 _AT_HEIGHT_M = 0.5
 _AT_LANDING_POINT_M = 0.5
 _AT_REST_M_S = 0.4
-# To leave those who are near, before it comes down through their heights.
+# Time to get clear of near robots before descending through their heights.
 _LEAVES_S = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One row: from any of `sources` to `target` when `why` gives a reason, in words.
+    """One row: from any of `sources` to `target` when `why` returns a reason.
 
-    `code` is what machines call the reason, and `when` what people call the row.
+    `code` is the reason for machines, `when` describes the row for people.
 
-    A row with `order` applies only in a tick that obeys such an order. `actions` are asked of the
-    autopilot once. `alarm`: the operator must see the reason for as long as the target lasts.
-    `land_by` is who has it land, if it then lands.
-    `left_alone`: whether the vehicle then hovers for no reason that anybody gave.
-    `looks_anew`: what was seen of a vehicle that this program steers counts no more, though it
-    steers it on. `keeps_target`: the state before goes on to where it was flying. `rejoins`: a
-    pilot's mode is to be ended. `kills`: the motors stop for good.
+    A row with `order` applies only in a tick that obeys such an order. `actions` are requested once
+    from the autopilot. `alarm`: the operator must see the reason while the target lasts. `land_by`
+    is the origin of a landing. `left_alone`: whether the vehicle then hovers without anybody's
+    command. `looks_anew`: earlier observations of a vehicle that this program continues to steer
+    are dropped. `keeps_target`: keep the target of the state before. `rejoins`: a pilot's mode is
+    to be ended. `kills`: the motors stop for good.
     """
 
     sources: tuple[FlightState, ...]
@@ -92,7 +90,7 @@ def _link_lost(t: Tick) -> str | None:
 
 def _disarmed_again(t: Tick) -> str | None:
     vehicle, flight = t.inputs.vehicle, t.flight
-    # Only with a position it is known whether the autopilot was switched on anew.
+    # Only a position shows whether the autopilot was rebooted.
     heard = min(vehicle.heartbeat_at_s, vehicle.position_at_s) > flight.since_s
     return _disarmed(t) if heard and not vehicle.fell and not flight.killed else None
 
@@ -123,7 +121,7 @@ def _armed_again(t: Tick) -> str | None:
 
 
 def _pilot(t: Tick) -> str | None:
-    # Right after a rejoin, the pilot's mode is the one that the operator wants to end.
+    # Right after a rejoin, the operator wants to end the pilot's mode.
     ending = not t.flight.reached and (
         t.inputs.now_s - t.flight.rejoined_at_s <= OFFBOARD_TIMEOUT_S
     )
@@ -151,7 +149,7 @@ def _lapse(t: Tick) -> str | None:
 
 
 def _autopilot_lands(t: Tick) -> str | None:
-    # Else it lands because it was told to, before this state.
+    # Otherwise it lands because of an earlier command.
     lapsed = t.flight.silent_until_s > -math.inf and not t.silent
     by_itself = t.flight.reached or t.overdue or lapsed or t.failsafe_acts
     return reason_if(t.mode is Mode.LAND and by_itself, "the autopilot lands by itself")
@@ -167,7 +165,7 @@ def _position_lost(t: Tick) -> str | None:
 
 
 def _on_ground(t: Tick) -> str | None:
-    # Nothing that the ground repeats may lift a vehicle off.
+    # No repeated command of the ground may lift a vehicle off.
     return reason_if(t.in_air is False and not t.silent, "it stands on the ground")
 
 
@@ -221,7 +219,7 @@ def _lands_without_remote_control(t: Tick) -> str | None:
 
 def _ground_long_lost(t: Tick) -> str | None:
     parameters = t.robot.parameters
-    # Not by the age of its newest word: one that is always late would never be lost for long.
+    # Not by the newest message's age: if all messages are late, that would never grow.
     at_s, age_s = t.flight.ground_at_s, t.inputs.ground_age_s
     never = at_s == -math.inf
     lost_s = age_s - parameters.ground_timeout_s if never else t.inputs.now_s - at_s
@@ -265,7 +263,7 @@ def _enabled(t: Tick) -> str | None:
 
 
 def _enabled_at_rest(t: Tick) -> str | None:
-    # Until then the operator sees why arming failed, and telemetry that the vehicle is disarmed.
+    # Until then the operator sees why arming failed, and telemetry shows the vehicle disarmed.
     return _enabled(t) if t.age_s > STALE_TELEMETRY_S else None
 
 
@@ -334,7 +332,7 @@ def _at_landing_point(t: Tick) -> str | None:
 
 
 def _refusal(t: Tick, action: Action) -> str:
-    """ ": reason" of the last command, if it was this one, of this state, and refused."""
+    """Text ": reason" if the last command was this one, in this state, and was refused; else ""."""
     result = t.inputs.vehicle.result
     if result is None or result.action is not action or result.accepted:
         return ""
@@ -347,7 +345,6 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition((_S.ARMING, *AIRBORNE, _S.PILOT), _S.PILOT, _R.DISARM_ORDERED,
                "the operator orders disarm, on the ground", _always("disarm ordered"),
                order="disarm", actions=(Action.DISARM,)),
-    # What the vehicle does, whoever made it.
     Transition((*AIRBORNE, _S.PILOT, _S.FAULT), _S.FAULT, _R.DISARMED_IN_AIR,
                "the vehicle is disarmed in the air, or its autopilot starts anew there", _fell,
                alarm=True),
@@ -368,7 +365,6 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition((_S.FAULT,), _S.PILOT, _R.ARMED_BEFORE,
                "the autopilot answers again, armed, and was not killed", _armed_again, alarm=True,
                left_alone="if in hold"),
-    # A pilot, and the autopilot's own failsafe.
     Transition(AIRBORNE, _S.PILOT, _R.PILOT, "a pilot's mode is on", _pilot, alarm=True),
     Transition(STEERED, _S.HOLD, _R.CONTROL_SILENT, "the control loop was silent", _lapse,
                alarm=True, left_alone="yes", looks_anew=True),
@@ -382,7 +378,6 @@ TRANSITIONS: tuple[Transition, ...] = (
                _autopilot_lands, alarm=True),
     Transition((_S.HOLD, _S.RETURN), _S.PILOT, _R.OFFBOARD_REFUSED, "offboard is refused",
                _offboard_refused, alarm=True, left_alone="if in hold"),
-    # What cannot wait for anybody.
     Transition(STEERED, _S.LAND, _R.POSITION_LOST, "the position is lost", _position_lost,
                alarm=True),
     Transition(STEERED, _S.LAND, _R.BATTERY_CRITICAL, "the battery is critical", _battery_critical,
@@ -393,11 +388,9 @@ TRANSITIONS: tuple[Transition, ...] = (
                "it does not hold its height", off_height, alarm=True),
     Transition((_S.HOLD,), _S.LAND, _R.OFF_HEIGHT, "the same, 3 s later", _long_off_height,
                alarm=True),
-    # The operator gives it away.
     Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.PILOT, _R.GIVEN_TO_PILOT,
                "the operator orders pilot", _always("given to a pilot"), order="pilot",
                actions=(Action.HOLD,), alarm=True),
-    # The ground holds, returns or lands it.
     Transition((_S.ARMING,), _S.IDLE, _R.ARMING_CALLED_OFF,
                "the ground commands hold, land or return, or is lost; the control loop was silent; "
                "the vehicle left offboard", _arming_called_off, actions=(Action.DISARM,),
@@ -414,7 +407,6 @@ TRANSITIONS: tuple[Transition, ...] = (
                _ground_returns),
     Transition((_S.LAND,), _S.RETURN, _R.GROUND_RETURNS,
                "the ground commands return, and had commanded land", _ground_returns_landing),
-    # What the robot notices by itself.
     Transition((_S.MISSION,), _S.HOLD, _R.TOO_CLOSE, "a neighbour is too close", too_close,
                alarm=True),
     Transition((_S.TAKEOFF, _S.MISSION), _S.HOLD, _R.REMOTE_CONTROL_LOST,
@@ -442,7 +434,6 @@ TRANSITIONS: tuple[Transition, ...] = (
                alarm=True),
     Transition((_S.MISSION,), _S.HOLD, _R.POLICY_STALE, "the policy has no fresh answer",
                policy_stale, alarm=True),
-    # The way of a flight.
     Transition((_S.INIT,), _S.IDLE, _R.FOUND, "autopilot, position and estimator origin are known",
                _found),
     Transition((_S.IDLE,), _S.PREFLIGHT, _R.ENABLED,
@@ -475,5 +466,5 @@ Rows = Mapping[FlightState, Sequence[Transition]]
 
 
 def by_state(rows: Sequence[Transition]) -> Rows:
-    """Rows that apply in each state, in their order."""
+    """The rows that apply in each state, in order."""
     return {state: [row for row in rows if state in row.sources] for state in FlightState}
