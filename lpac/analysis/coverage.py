@@ -65,6 +65,14 @@ class Coverage:
         importance = rasterize(features, world.world_size, world.truncation, world.norm)
         return cls(importance, world.env_scale, features)
 
+    @classmethod
+    def known(cls, world: World) -> "Coverage | None":
+        """None if the world's text is not known, or no world file."""
+        try:
+            return cls.of(world) if world.world else None
+        except ValueError:
+            return None
+
     def cost(self, positions_m: F64) -> float:
         """The paper's coverage cost J in model units (see `coverage_cost`); N >= 1."""
         return coverage_cost(self.importance, positions_m * self.cells_per_m)

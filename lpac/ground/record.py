@@ -18,23 +18,19 @@ import dataclasses
 import os
 import signal
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-
-from edge.core import F64
 from edge.core.counted import counted
 from edge.core.file_errors import in_words
 from edge.drivers.flight_log import FlightLog, topic
-from edge.messages.mission import FlightState, GroundState, RobotStatus
-from lpac.analysis.coverage import Coverage, LastPositions, in_air
-from lpac.analysis.mission_tracker import MissionTracker
+from edge.messages.mission import GroundState, RobotStatus
+from lpac.analysis.coverage import in_air
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
+from lpac.ground.cost import Cost, MissionCosts, positions_of
 from lpac.ground.station.client import GroundError, listen
 from lpac.ground.station.protocol import ServerMessage
 
@@ -44,26 +40,6 @@ _SHOW_PERIOD_S = 5.0
 _RETRY_S = 0.5
 _LOOK_AGAIN_S = 0.5
 _MAX_TOTAL_BYTES = 2**34
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """Cost of the robots' positions now: the paper's J, model units.
-
-    `robots` are those that count, by name (see `lpac.analysis.coverage.LastPositions`);
-    `flying_mission` whether one of them flies its mission, which begins anew as
-    `lpac.analysis.mission_tracker` says. `initial` is J when the first of this trial did;
-    `normalized` is J over that; `bound` is what Lloyd's algorithm comes to, which
-    knows the world, with so many robots: no bound, though logs call it so. These are None before.
-    """
-
-    trial: str
-    robots: tuple[str, ...]
-    flying_mission: bool
-    cost: float
-    initial: float | None
-    normalized: float | None
-    bound: float | None
 
 
 TOPICS = {
@@ -96,12 +72,9 @@ class Recording:
     def __init__(self, record: Callable[[str, float, Mapping[str, object]], None]) -> None:
         """`record` gets topic, Unix time in s, and message."""
         self._record = record
-        self._pool = ThreadPoolExecutor(1)
-        # Of the mission that began last, by world, trial and number of robots.
-        self._bounds: dict[tuple[str, str, int], Future[float]] = {}
+        self._costs = MissionCosts()
         self._setup: FleetSetup | None = None
         self._setup_at_s = 0.0
-        self._coverage: Coverage | None = None
         self._state: GroundState | None = None
         # Of each robot: boot nonce and sequence of the newest status.
         self._statuses: dict[str, tuple[int, int]] = {}
@@ -109,10 +82,6 @@ class Recording:
         self._events: deque[GroundEvent] = deque(maxlen=400)
         self._explored: dict[str, str] = {}
         self._cost_at_s = 0.0
-        self._last_positions = LastPositions()
-        self._mission_tracker = MissionTracker()
-        # J at the start of each trial's last mission.
-        self._initial: dict[str, float] = {}
         self.cost: Cost | None = None
         self.flying = False
 
@@ -132,14 +101,10 @@ class Recording:
 
     def close(self) -> None:
         """Leave what is being computed."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._costs.close()
 
     def _take_setup(self, setup: FleetSetup, unix_now_s: float) -> None:
-        if self._setup is None or self._setup.world != setup.world:
-            self._coverage = None
-            # Nothing else depends on a world that cannot be read, or is not known.
-            with contextlib.suppress(ValueError):
-                self._coverage = Coverage.of(setup) if setup.world else None
+        self._costs.take_setup(setup)
         self._setup, self._setup_at_s = setup, unix_now_s
         self._record("setup", unix_now_s, dataclasses.asdict(setup))
 
@@ -156,9 +121,6 @@ class Recording:
             status = robot.status
             if status is None or robot.age_s is None:
                 continue
-            if self._mission_tracker.begins(robot.robot_id, status, now_s - robot.age_s):
-                self._initial.pop(status.trial, None)
-                self._bounds.clear()
             at = (status.boot_nonce, status.sequence)
             if self._statuses.get(robot.name) == at:
                 continue
@@ -169,45 +131,13 @@ class Recording:
                 "clock_offset_s": robot.clock_offset_s,
             }  # fmt: skip
             self._record("status", heard_at_s, heard)
-        places_m = self._last_positions.counted(snapshot)
-        if abs(now_s - self._cost_at_s) >= COST_PERIOD_S and self._coverage is not None:
-            self._take_cost(snapshot, places_m, self._coverage)
-
-    def _take_cost(
-        self,
-        snapshot: FleetSnapshot,
-        places_m: Mapping[str, tuple[float, float]],
-        coverage: Coverage,
-    ) -> None:
-        self._cost_at_s = snapshot.unix_time_s
-        if not places_m:
-            self.cost = None
-            return
-        positions_m = np.array(list(places_m.values()))
-        cost = coverage.cost(positions_m)
-        statuses = [
-            r.status for r in snapshot.robots if r.name in places_m and r.status is not None
-        ]
-        flying = [status for status in statuses if status.state is FlightState.MISSION]
-        # As the robots say: a ground that has just started does not know it yet.
-        ((trial, _),) = Counter(s.trial for s in flying or statuses).most_common(1)
-        if flying:
-            self._initial.setdefault(trial, cost)
-        initial = self._initial.get(trial)
-        self.cost = Cost(
-            trial, tuple(places_m), bool(flying), cost, initial,
-            normalized=cost / initial if initial else None,
-            bound=None if initial is None else self._bound(coverage, trial, positions_m),
-        )  # fmt: skip
-        self._record("cost", snapshot.unix_time_s, dataclasses.asdict(self.cost))
-
-    def _bound(self, coverage: Coverage, trial: str, positions_m: F64) -> float | None:
-        """Computed beside all else, once per world, trial and number; None until it is known."""
-        assert self._setup is not None
-        key = (self._setup.world_id, trial, len(positions_m))
-        if key not in self._bounds:
-            self._bounds[key] = self._pool.submit(coverage.lloyd, positions_m)
-        return self._bounds[key].result() if self._bounds[key].done() else None
+        places_m, coverage = self._costs.follow(snapshot), self._costs.coverage
+        if abs(now_s - self._cost_at_s) >= COST_PERIOD_S and coverage is not None:
+            self._cost_at_s, self.cost = now_s, None
+            if places_m:
+                cost = coverage.cost(positions_of(places_m))
+                self.cost = self._costs.cost(snapshot, places_m, cost)
+                self._record("cost", now_s, dataclasses.asdict(self.cost))
 
 
 def record(

@@ -20,7 +20,6 @@ All in the frame `mission`: x right, y forward, z up, m.
 """
 
 import base64
-import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -66,7 +65,7 @@ from lpac.analysis.snapshot import (
     RobotSnapshot,
 )
 from lpac.ground.alarms import alarms
-from lpac.ground.record import Cost
+from lpac.ground.cost import Cost
 from lpac.ground.rendering import Row, cell, problem, rows, speed_m_s, state_word
 
 FRAME = "mission"
@@ -189,10 +188,7 @@ class FoxgloveView:
 
     def _take_setup(self, setup: FleetSetup) -> None:
         if self._setup is None or self._setup.world != setup.world:
-            self._coverage = None
-            # Nothing else depends on a world that cannot be read, or is not known.
-            with contextlib.suppress(ValueError):
-                self._coverage = Coverage.of(setup) if setup.world else None
+            self._coverage = Coverage.known(setup)
         self._setup = setup
 
     def _take_status(self, name: str, status: RobotStatus, unix_time_s: float) -> Iterator[Shown]:

@@ -15,18 +15,17 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from aiohttp import WSMsgType, web
 
-from edge.core import F64
-from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
 from lpac.ground.alarms import Alarm, Before, alarms
+from lpac.ground.cost import Cost, MissionCosts, positions_of
 from lpac.ground.map.access import Access, reached_at
 from lpac.ground.map.connections import Connection, accepting
 from lpac.ground.map.view import (
+    Curve,
     Json,
-    Missions,
+    Paths,
     detail_view,
     report_view,
     setup_view,
@@ -110,7 +109,6 @@ class LiveMap:
         self._tasks: set[asyncio.Task[None]] = set()
         self._problem = "no word from the ground process yet"
         self._setup: FleetSetup | None = None
-        self._coverage: Coverage | None = None
         self._setup_text = ""
         self._snapshot: FleetSnapshot | None = None
         # Of the robots that count for the cost, in this snapshot, m.
@@ -119,7 +117,9 @@ class LiveMap:
         self._before = Before()
         self._explored: dict[str, Explored] = {}
         self._events: deque[GroundEvent] = deque(maxlen=_MAX_EVENTS)
-        self._missions = Missions()
+        self._costs = MissionCosts()
+        self._curve: Curve | None = None
+        self._paths = Paths()
         self._new_snapshot = asyncio.Event()
 
     def app(self) -> web.Application:
@@ -141,7 +141,7 @@ class LiveMap:
                     await self._take(message)
             except (OSError, ValueError) as error:
                 self._problem = str(error)
-                self._missions.interrupt()
+                self._costs.interrupt()
                 self._before = Before()
                 self._put(self._ground_view())
             await asyncio.sleep(_RETRY_S)
@@ -161,15 +161,9 @@ class LiveMap:
                 self._put(_explored_view(message), message.robot)
 
     async def _take_setup(self, setup: FleetSetup) -> None:
-        if self._setup is None or self._setup.world != setup.world:
-            self._coverage = None
-            # Nothing else depends on a world that cannot be read, or is not known.
-            with contextlib.suppress(ValueError):
-                if setup.world:
-                    self._coverage = await asyncio.to_thread(Coverage.of, setup)
-            self._missions.change_world()
+        await asyncio.to_thread(self._costs.take_setup, setup)
         self._setup = setup
-        self._setup_text = _text(setup_view(setup, self._coverage))
+        self._setup_text = _text(setup_view(setup, self._costs.coverage))
         for page in self._pages:
             page.put(self._setup_text, "setup")
 
@@ -179,7 +173,8 @@ class LiveMap:
         self._snapshot = snapshot
         before = self._before.take(snapshot, time.monotonic())
         self._alarms = alarms(self._setup, snapshot, before)
-        self._places_m = self._missions.take(snapshot)
+        self._places_m = self._costs.follow(snapshot)
+        self._paths.take(snapshot, self._places_m)
         self._new_snapshot.set()
         if self._problem:
             self._problem = ""
@@ -203,31 +198,27 @@ class LiveMap:
             await self._new_snapshot.wait()
             self._new_snapshot.clear()
             if self._snapshot is not None:
-                await self._compute(self._snapshot, self._places_m, self._coverage)
+                await self._compute(self._snapshot, self._places_m)
 
     async def _compute(
-        self,
-        snapshot: FleetSnapshot,
-        places_m: dict[str, tuple[float, float]],
-        coverage: Coverage | None,
+        self, snapshot: FleetSnapshot, places_m: dict[str, tuple[float, float]]
     ) -> None:
+        coverage = self._costs.coverage
         if coverage is None or not places_m:
             self._put({"kind": "coverage", "cost": None, "time_s": None, "cells": {}})
             return
-        positions_m = np.array(list(places_m.values()))
+        positions_m = positions_of(places_m)
         cost, cells_m = await asyncio.to_thread(
             lambda: (coverage.cost(positions_m), coverage.cells_m(positions_m))
         )
-        if self._missions.begins(snapshot):
-            curve = self._missions.begin(snapshot, cost)
-            self._put(curve.view())
-            self._start(self._find_lloyd(coverage, positions_m))
-        time_s = self._missions.time_s(snapshot)
-        curve_now = self._missions.curve
-        share = None
-        if curve_now is not None and time_s is not None:
-            curve_now.add(time_s, cost)
-            share = curve_now.share(cost)
+        if coverage is not self._costs.coverage:
+            return
+        judged, share = self._costs.cost(snapshot, places_m, cost), None
+        time_s = self._costs.mission_s(snapshot)
+        curve = self._curve_of(judged)
+        if curve is not None and time_s is not None and judged.normalized is not None:
+            share = round(judged.normalized, 4)
+            curve.add(time_s, share)
         cells = {
             name: [[round(x_m, 2), round(y_m, 2)] for x_m, y_m in cell]
             for name, cell in zip(places_m, cells_m, strict=True)
@@ -236,12 +227,21 @@ class LiveMap:
             {"kind": "coverage", "cost": cost, "share": share, "time_s": time_s, "cells": cells}
         )
 
-    async def _find_lloyd(self, coverage: Coverage, positions_m: F64) -> None:
-        curve = self._missions.curve
-        lloyd = await asyncio.to_thread(coverage.lloyd, positions_m)
-        if curve is not None and curve is self._missions.curve:
-            curve.lloyd = curve.share(lloyd)
-            self._put(curve.view())
+    def _curve_of(self, cost: Cost) -> Curve | None:
+        """The mission's curve; pages are told of a new one, and of its Lloyd's cost."""
+        began_s, curve, lloyd = self._costs.began_s, self._curve, None
+        if began_s is None:
+            return None
+        if cost.bound is not None and cost.initial:
+            lloyd = round(cost.bound / cost.initial, 4)
+        if curve is None or curve.began_s != began_s:
+            self._paths.clear()
+            self._curve = curve = Curve(cost.trial, began_s, self._costs.whole, lloyd)
+        elif lloyd in (None, curve.lloyd):
+            return curve
+        curve.lloyd = lloyd
+        self._put(curve.view())
+        return curve
 
     # To the pages
 
@@ -262,13 +262,13 @@ class LiveMap:
         if self._setup is None:
             return
         page.put(self._setup_text, "setup")
-        page.put(_text(self._missions.paths_view()), "paths")
+        page.put(_text(self._paths.view()), "paths")
         for explored in self._explored.values():
             page.put(_text(_explored_view(explored)), "explored" + explored.robot)
         for event in self._events:
             page.put_each(_text(_event_view(event)))
-        if self._missions.curve is not None:
-            page.put(_text(self._missions.curve.view()), "curve")
+        if self._curve is not None:
+            page.put(_text(self._curve.view()), "curve")
         if self._snapshot is not None:
             view = snapshot_view(self._setup, self._snapshot, self._alarms)
             page.put(_text(view), "snapshot")

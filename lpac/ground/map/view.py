@@ -8,13 +8,12 @@ import base64
 import dataclasses
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from edge.messages.mission import FlightState, GroundState, RobotStatus
-from lpac.analysis.coverage import Coverage, LastPositions, in_air
-from lpac.analysis.mission_tracker import MissionTracker
+from edge.messages.mission import GroundState, RobotStatus
+from lpac.analysis.coverage import Coverage, in_air
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.alarms import Alarm
 from lpac.ground.rendering import (
@@ -38,8 +37,6 @@ DENSITY_CELLS = 256
 # Cells of a robot's row; the style of a robot that is not heard.
 _CELLS = ("height", "battery", "satellites", "link")
 _LOST = "lost"
-# The cost of these counts: a mission may be interrupted, and ends with return or land.
-_IN_MISSION = (FlightState.MISSION, FlightState.HOLD, FlightState.PILOT)
 _MAX_POINTS = 3000
 _PATH_POINTS = 400
 _PATH_STEP_M = 0.15
@@ -153,112 +150,52 @@ def report_view(action: str, report: CommandReport) -> Json:
 
 @dataclass(slots=True)
 class Curve:
-    """The coverage cost of one trial: `points` are (mission time, s; J over `first_cost`).
+    """The coverage cost of one mission: `points` are (mission time, s; J over that of the start).
 
-    The mission began at `began_s` (unix time) with J = `first_cost`, unless not `whole`: then the
-    first snapshot showed it under way. `lloyd` is over `first_cost`,
-    too: the J of Lloyd's algorithm, which knows the world.
+    The mission began at `began_s` (Unix time), unless not `whole`: then the first snapshot showed
+    it under way. `lloyd` is over J of the start, too: of Lloyd's algorithm, which knows the world.
     """
 
     trial: str
     began_s: float
     whole: bool
-    first_cost: float
     lloyd: float | None = None
     points: list[tuple[float, float]] = field(default_factory=list)
 
-    def add(self, time_s: float, cost: float) -> None:
+    def add(self, time_s: float, share: float) -> None:
         """Of a long mission every second point is forgotten, now and then."""
         if len(self.points) >= _MAX_POINTS:
             del self.points[1::2]
-        self.points.append((round(time_s, 2), self.share(cost)))
-
-    def share(self, cost: float) -> float:
-        """The cost over that of the start; 1 in a world without importance."""
-        return round(cost / self.first_cost, 4) if self.first_cost > 0.0 else 1.0
+        self.points.append((round(time_s, 2), share))
 
     def view(self) -> Json:
         """All of it."""
         return {"kind": "curve", **dataclasses.asdict(self)}
 
 
-class Missions:
-    """Tells when missions begin and how long they last, and keeps the robots' paths."""
+class Paths:
+    """Where robots flew in this mission."""
 
     def __init__(self) -> None:
-        self.curve: Curve | None = None
         self._paths: dict[str, deque[tuple[float, float]]] = {}
-        self._seen_before = False
-        self._mission_tracker = MissionTracker()
-        self._last_positions = LastPositions()
 
-    def begins(self, snapshot: FleetSnapshot) -> bool:
-        """Whether this snapshot shows a mission that has no curve yet."""
-        return self.curve is None and _flies_mission(snapshot)
-
-    def begin(self, snapshot: FleetSnapshot, cost: float) -> Curve:
-        """Begin another curve, and other paths."""
+    def clear(self) -> None:
+        """Another mission begins."""
         self._paths.clear()
-        self.curve = Curve(_trial(snapshot), snapshot.unix_time_s, self._seen_before, cost)
-        return self.curve
 
-    def time_s(self, snapshot: FleetSnapshot) -> float | None:
-        """The mission time; None if none is flown now."""
-        if self.curve is None or not any(
-            robot.fresh
-            and robot.status is not None
-            and robot.status.state in _IN_MISSION
-            and robot.robot_id in self._mission_tracker.robots
-            for robot in snapshot.robots
-        ):
-            return None
-        return max(0.0, snapshot.unix_time_s - self.curve.began_s)
-
-    def interrupt(self) -> None:
-        """The ground is gone: who knows what begins meanwhile."""
-        self._seen_before = False
-
-    def change_world(self) -> None:
-        """No cost of before can be compared with those of now."""
-        self.curve = None
-        self._seen_before = False
-
-    def take(self, snapshot: FleetSnapshot) -> dict[str, tuple[float, float]]:
-        """Take the next snapshot; gives the robots that count for J, and where they are, m."""
-        if not _flies_mission(snapshot):
-            self._seen_before = True
-        flying = set()
+    def take(self, snapshot: FleetSnapshot, places_m: Mapping[str, tuple[float, float]]) -> None:
+        """Take where robots are; only those in the air leave a path."""
         for robot in snapshot.robots:
-            if robot.status is None or robot.age_s is None:
+            if robot.name not in places_m or robot.status is None or not in_air(robot.status):
                 continue
-            if in_air(robot.status):
-                flying.add(robot.name)
-            heard_s = snapshot.unix_time_s - robot.age_s
-            if self._mission_tracker.begins(robot.robot_id, robot.status, heard_s):
-                self.curve = None
-        places_m = self._last_positions.counted(snapshot)
-        for name, (x_m, y_m) in places_m.items():
-            if name not in flying:
-                continue
-            path = self._paths.setdefault(name, deque(maxlen=_PATH_POINTS))
-            if not path or math.dist(path[-1], (x_m, y_m)) >= _PATH_STEP_M:
-                path.append((round(x_m, 2), round(y_m, 2)))
-        return places_m
+            place_m = places_m[robot.name]
+            path = self._paths.setdefault(robot.name, deque(maxlen=_PATH_POINTS))
+            if not path or math.dist(path[-1], place_m) >= _PATH_STEP_M:
+                path.append((round(place_m[0], 2), round(place_m[1], 2)))
 
-    def paths_view(self) -> Json:
-        """The robots' paths, for a page that opens."""
+    def view(self) -> Json:
+        """All of them, for a page that opens."""
         return {"kind": "paths", "paths": {name: list(p) for name, p in self._paths.items()}}
-
-
-def _flies_mission(snapshot: FleetSnapshot) -> bool:
-    return any(
-        robot.fresh and robot.status is not None and robot.status.state is FlightState.MISSION
-        for robot in snapshot.robots
-    )
-
-
-def _trial(snapshot: FleetSnapshot) -> str:
-    return "" if snapshot.ground is None else snapshot.ground.trial
 
 
 def _yaw_rad(status: RobotStatus, heading_deg: float | None) -> float | None:

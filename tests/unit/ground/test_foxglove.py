@@ -22,10 +22,11 @@ from edge.messages.mission import FlightState, GroundState, explored_to_bytes
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import Explored, GroundEvent
 from lpac.cli.foxglove import _LAYOUT, app
+from lpac.ground.cost import Cost
 from lpac.ground.foxglove.channels import Channels
 from lpac.ground.foxglove.logs import convert, ground_logs
 from lpac.ground.foxglove.view import FRAME, FoxgloveView
-from lpac.ground.record import TOPICS, Cost, GroundMetadata, Recording
+from lpac.ground.record import TOPICS, GroundMetadata, Recording
 from tests.foxglove_client import decoded
 from tests.unit.ground.snapshots import FENCE, on_ground, robot, setup, snapshot, status
 

@@ -9,9 +9,10 @@ import pytest
 from edge.core.address import is_loopback
 from edge.messages.mission import ON_GROUND, FlightState, GroundState
 from lpac.analysis.snapshot import FleetSnapshot
+from lpac.ground.cost import MissionCosts
 from lpac.ground.map.access import Access
 from lpac.ground.map.server import _PAGE as PAGE
-from lpac.ground.map.view import Missions, detail_view, setup_view, snapshot_view
+from lpac.ground.map.view import Curve, Paths, detail_view, setup_view, snapshot_view
 from lpac.ground.rendering import Row
 from tests.unit.ground.snapshots import (
     FENCE,
@@ -70,30 +71,38 @@ def snapshot_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> Fl
     return FleetSnapshot(unix_time_s, "alice", ground, (robot(said),))
 
 
+def begins(costs: MissionCosts, seen: FleetSnapshot, cost: float = 50.0) -> bool:
+    """Take a picture and its cost; whether a mission begins with it."""
+    places_m = costs.follow(seen)
+    before = costs.began_s
+    judged = costs.cost(seen, places_m, cost)
+    assert (judged.initial is None) == (costs.began_s is None)
+    return costs.began_s not in (before, None)
+
+
 def test_a_page_that_opens_late_has_the_whole_curve() -> None:
-    missions = Missions()
+    costs = MissionCosts()
+    costs.take_setup(setup(2))
     waiting, flying = (
         snapshot_of(state, 100.0) for state in (FlightState.HOLD, FlightState.MISSION)
     )
-    missions.take(waiting)
-    assert not missions.begins(waiting) and missions.time_s(waiting) is None
-    missions.take(flying)
-    assert missions.begins(flying)
-    curve = missions.begin(flying, 50.0)
-    curve.lloyd = curve.share(10.0)
+    assert not begins(costs, waiting) and costs.mission_s(waiting) is None
+    assert begins(costs, flying) and costs.whole and costs.began_s == 100.0
+    curve = Curve("t1", 100.0, whole=True, lloyd=0.2)
     for n in range(5000):
-        curve.add(0.4 * n, 50.0 - 0.005 * n)
+        curve.add(0.4 * n, round(1.0 - 0.0001 * n, 4))
     view = curve.view()
     assert view["whole"] and view["began_s"] == 100.0 and view["lloyd"] == 0.2
     assert view["points"][0] == (0.0, 1.0) and view["points"][-1] == (1999.6, 0.5001)
     assert len(view["points"]) <= 3000
     # Hold is part of a mission, landing is not.
-    assert missions.time_s(snapshot_of(FlightState.HOLD, 160.0)) == 60.0
-    assert missions.time_s(snapshot_of(FlightState.LAND, 160.0)) is None
-    assert not missions.begins(snapshot_of(FlightState.MISSION, 170.0))
+    assert costs.mission_s(snapshot_of(FlightState.HOLD, 160.0)) == 60.0
+    assert costs.mission_s(snapshot_of(FlightState.LAND, 160.0)) is None
+    assert not begins(costs, snapshot_of(FlightState.MISSION, 170.0))
     # What was seen of it over another world is nothing to compare with.
-    missions.change_world()
-    assert not missions.begin(snapshot_of(FlightState.MISSION, 180.0), 40.0).whole
+    costs.take_setup(replace(setup(2), world="CircularBND 9 9 4 1\n"))
+    assert begins(costs, snapshot_of(FlightState.MISSION, 180.0), 40.0) and not costs.whole
+    costs.close()
 
 
 @pytest.mark.parametrize(
@@ -108,18 +117,17 @@ def test_a_page_that_opens_late_has_the_whole_curve() -> None:
 def test_a_mission_after_another_is_a_new_curve(
     between: FleetSnapshot, trial: str, anew: bool
 ) -> None:
-    missions = Missions()
-    flying = snapshot_of(FlightState.MISSION, 100.0)
-    missions.take(flying)
-    missions.begin(flying, 50.0)
-    missions.take(between)
+    costs = MissionCosts()
+    costs.take_setup(setup(2))
+    assert begins(costs, snapshot_of(FlightState.MISSION, 100.0))
+    costs.follow(between)
     waiting, again = (
         snapshot_of(state, 120.0, trial) for state in (FlightState.HOLD, FlightState.MISSION)
     )
-    missions.take(waiting)
-    assert (missions.time_s(waiting) is None) == anew
-    missions.take(again)
-    assert missions.begins(again) == anew
+    costs.follow(waiting)
+    assert (costs.mission_s(waiting) is None) == anew
+    assert begins(costs, again) == anew
+    costs.close()
 
 
 def test_what_the_page_is_told_of_the_fleet() -> None:
@@ -160,11 +168,11 @@ def test_what_the_page_is_told_of_the_fleet() -> None:
 
 
 def test_who_stands_on_the_ground_leaves_no_path() -> None:
-    missions = Missions()
-    missions.take(snapshot_of(FlightState.LANDED, 100.0))
-    assert missions.paths_view()["paths"] == {}
-    missions.take(snapshot_of(FlightState.MISSION, 101.0))
-    assert missions.paths_view()["paths"] == {"r1": [(5.0, 12.0)]}
+    paths, places_m = Paths(), {"r1": (5.0, 12.0)}
+    paths.take(snapshot_of(FlightState.LANDED, 100.0), places_m)
+    assert paths.view()["paths"] == {}
+    paths.take(snapshot_of(FlightState.MISSION, 101.0), places_m)
+    assert paths.view()["paths"] == {"r1": [(5.0, 12.0)]}
 
 
 def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:

@@ -121,7 +121,7 @@ def test_a_name_that_is_flown_again_begins_anew(monkeypatch: pytest.MonkeyPatch)
     flown = ((S.MISSION, 1.0), (S.HOLD, 5.0), (S.MISSION, 6.0), (S.LANDED, 7.0), (S.HOLD, 7.0))
     for second, (state, x_m) in enumerate((*flown, (S.MISSION, 9.0)), 1):
         kept.recording.take(snapshot(float(second), second, x_m, state), float(second))
-    kept.recording._pool.shutdown()
+    kept.recording._costs._pool.shutdown()
     assert [positions_m[0, 0] for positions_m in bounds] == [1.0, 9.0]
     costs = kept.of("cost")
     first = costs[0]["cost"]
