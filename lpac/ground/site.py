@@ -4,6 +4,7 @@ A site is `sites/NAME.toml` beside fleet.toml, in the mission frame, m. Who stan
 from what robots say of themselves, averaged over their statuses.
 """
 
+import cmath
 import itertools
 import math
 import os
@@ -64,11 +65,10 @@ class Standing(NamedTuple):
 
 def circular_mean_deg(headings_deg: Sequence[float]) -> CircularMean:
     """Raises ValueError if there are none, or they point all ways."""
-    sin = math.fsum(math.sin(math.radians(h)) for h in headings_deg)
-    cos = math.fsum(math.cos(math.radians(h)) for h in headings_deg)
-    if not math.hypot(sin, cos) > 1e-6 * max(len(headings_deg), 1):
+    total = sum(cmath.rect(1.0, math.radians(h)) for h in headings_deg)
+    if not abs(total) > 1e-6 * max(len(headings_deg), 1):
         raise ValueError("the headings have no mean")
-    mean_deg = _compass_deg(math.degrees(math.atan2(sin, cos)))
+    mean_deg = _compass_deg(math.degrees(cmath.phase(total)))
     return CircularMean(mean_deg, max(abs(turn_deg(mean_deg, h)) for h in headings_deg))
 
 
@@ -510,35 +510,35 @@ def _written(point: Iterable[float]) -> str:
 
 
 def _toml(name: str, site: SavedSite) -> str:
-    fence = site.fence
-    lines = [
-        f"# Site {name}: `lpac site save` wrote it, `lpac site use {name}` takes it. All points",
-        "# are (x, y) of the mission frame, m; heights are above the pads.",
-        "",
-        "[origin]",
-        f"latitude_deg = {site.origin.latitude_deg!r}",
-        f"longitude_deg = {site.origin.longitude_deg!r}",
-        f"heading_deg = {site.origin.heading_deg!r}  # of the y axis, clockwise from true north",
-        "",
-        "[fence]",
-        f"vertices_m = [{', '.join(_pair(vertex) for vertex in fence.vertices_m)}]",
-        f"buffer_m = {fence.buffer_m!r}",
-        f"floor_m = {fence.floor_m!r}",
-        f"ceiling_m = {fence.ceiling_m!r}",
-    ]
-    for slot in site.slots:
-        lines += [
-            "",
-            "[[slots]]",
-            f"height = {slot.height}",
-            f"pad_m = {_pair(slot.pad_m)}",
-            f"landing_point_m = {_pair(slot.landing_point_m)}",
-        ]
-    return "\n".join(lines) + "\n"
+    origin, fence = site.origin, site.fence
+    slots = (
+        f"""
+[[slots]]
+height = {slot.height}
+pad_m = {_pair(slot.pad_m)}
+landing_point_m = {_pair(slot.landing_point_m)}
+"""
+        for slot in site.slots
+    )
+    return f"""\
+# Site {name}: `lpac site save` wrote it, `lpac site use {name}` takes it. All points
+# are (x, y) of the mission frame, m; heights are above the pads.
+
+[origin]
+latitude_deg = {origin.latitude_deg!r}
+longitude_deg = {origin.longitude_deg!r}
+heading_deg = {origin.heading_deg!r}  # of the y axis, clockwise from true north
+
+[fence]
+vertices_m = [{", ".join(map(_pair, fence.vertices_m))}]
+buffer_m = {fence.buffer_m!r}
+floor_m = {fence.floor_m!r}
+ceiling_m = {fence.ceiling_m!r}
+{"".join(slots)}"""
 
 
 def _pair(point: Iterable[float]) -> str:
-    return f"[{', '.join(repr(float(value)) for value in point)}]"
+    return str([float(value) for value in point])
 
 
 def _write(path: Path, text: str) -> None:
