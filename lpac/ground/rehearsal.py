@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from edge.core.fence import Fence
 from edge.messages.mission import RobotStatus
+from lpac.ground.rendering import nose_rad
 from lpac.ground.site import turn_deg
 
 _ARROWS = "↑↗→↘↓↙←↖"
@@ -58,10 +59,8 @@ class Carried(NamedTuple):
 def carried(status: RobotStatus, configured: Fence) -> Carried:
     """Read a robot's status for the person who carries it."""
     position_m = None if status.position_m is None else status.position_m[:2]
-    nose_deg = None
-    if status.heading_rad is not None and status.origin is not None:
-        nose_deg = math.degrees(status.heading_rad) - status.origin.heading_deg
-        nose_deg = turn_deg(0.0, nose_deg) % 360.0
+    nose = nose_rad(status)
+    nose_deg = None if nose is None else turn_deg(0.0, math.degrees(nose)) % 360.0
     fence = status.fence or configured
     velocity = status.policy_velocity_m_s
     return Carried(

@@ -135,6 +135,17 @@ def fence_size(fence: Fence) -> str:
     return f"{sides} m, {fence.floor_m:g}-{fence.ceiling_m:g} m high"
 
 
+def nose_rad(status: RobotStatus, heading_deg: float | None = None) -> float | None:
+    """Direction of its nose, clockwise from the mission frame's y axis; None if it is not known.
+
+    `heading_deg` is that axis's, for a robot that has no origin yet.
+    """
+    own_deg = heading_deg if status.origin is None else status.origin.heading_deg
+    if status.heading_rad is None or own_deg is None:
+        return None
+    return status.heading_rad - math.radians(own_deg)
+
+
 # State, and why
 
 

@@ -18,10 +18,10 @@ from edge.core.frames import Latitude, Longitude
 from edge.core.schema import Bounded, ConfigError, NonNegative, from_mapping
 from edge.core.toml import read_toml
 from edge.core.world import has_importance, parse_world
-from edge.messages.codes import texts
 from edge.messages.mission import FlightState, GroundState, Heading, Origin, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.procedure import Ground, Procedure, Until, fresh_snapshot, gather
+from lpac.ground.rendering import NOT_HEARD, missing_checks, state_and_reason
 from lpac.ground.site import SavedSite, Sites, origin_at, places_at, standing
 from lpac.ground.station.protocol import (
     CommandReport,
@@ -481,26 +481,21 @@ class ScriptRun:
     def _not_ready(self, snapshot: FleetSnapshot) -> dict[Hashable, str]:
         """Obstacles to takeoff, in words, by what each is."""
         missing: dict[Hashable, str] = {}
-        statuses = self._statuses(snapshot)
+        statuses, ground = self._statuses(snapshot), snapshot.ground
         for name in self.robots:
             status = statuses.get(name)
-            safety_action = (
-                snapshot.ground.safety_action_for(status.robot_id)
-                if snapshot.ground and status
-                else "none"
-            )
+            asked = ground.safety_action_for(status.robot_id) if ground and status else "none"
             if status is None:
-                missing[name, "not heard"] = f"{name} is not heard"
-            elif safety_action != "none":
-                missing[name, safety_action] = (
-                    f"{name} is told to {safety_action}: withdraw it by `lpac mission resume`"
-                )
+                missing[name, NOT_HEARD] = f"{name} is {NOT_HEARD}"
+            elif asked != "none":
+                text = f"{name} is told to {asked}: withdraw it by `lpac mission resume`"
+                missing[name, asked] = text
             elif status.state is not _S.PREFLIGHT:
-                text = f"{name} is in {status.state}: {status.reason.text}"
+                text = f"{name} is in {state_and_reason(status)}"
                 missing[name, status.state, status.reason.code] = text
             elif not status.ready:
-                checks = texts(status.failed_checks) or "its checks are running"
-                missing[name, *(check.code for check in status.failed_checks)] = f"{name}: {checks}"
+                codes = (check.code for check in status.failed_checks)
+                missing[name, *codes] = f"{name}: {missing_checks(status)}"
         return missing
 
     def _bring_down(self, request: SafetyCommand) -> Procedure[None]:
@@ -530,13 +525,13 @@ class ScriptRun:
             for name in self.robots:
                 status = statuses.get(name)
                 if status is None:
-                    self._say_once((name, "not heard"), f"{name} is not heard")
+                    self._say_once((name, NOT_HEARD), f"{name} is {NOT_HEARD}")
                     continue
                 given = name in self.given or _asked(snapshot.ground, status.robot_id) != "none"
                 if status.state is not _S.HOLD or given:
                     left_alone.discard(name)
                 if before[name] is _S.MISSION and status.state is not _S.MISSION and not given:
-                    text = f"{name} left the mission: {status.state}: {status.reason.text}"
+                    text = f"{name} left the mission: {state_and_reason(status)}"
                     self._say_once((name, status.state, status.reason.code), text)
                     if status.state is _S.HOLD:
                         left_alone.add(name)

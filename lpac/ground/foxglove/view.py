@@ -66,7 +66,7 @@ from lpac.analysis.snapshot import (
 )
 from lpac.ground.alarms import alarms
 from lpac.ground.cost import Cost
-from lpac.ground.rendering import Row, cell, problem, rows, speed_m_s, state_word
+from lpac.ground.rendering import Row, cell, nose_rad, problem, rows, speed_m_s, state_word
 
 FRAME = "mission"
 FLEET_PERIOD_S = 0.5
@@ -348,9 +348,7 @@ def _shown_row(row: Row) -> ShownRobot:
 
 def _yaw_rad(status: RobotStatus) -> float:
     """From the mission frame's x axis to its y axis; along y as long as it is not known."""
-    if status.heading_rad is None or status.origin is None:
-        return math.pi / 2.0
-    return math.pi / 2.0 - (status.heading_rad - math.radians(status.origin.heading_deg))
+    return math.pi / 2.0 - (nose_rad(status) or 0.0)
 
 
 def _pose(status: RobotStatus) -> Pose:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from edge.messages.mission import GroundState, RobotStatus
+from edge.messages.mission import GroundState
 from lpac.analysis.coverage import Coverage, in_air
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.alarms import Alarm
@@ -21,6 +21,7 @@ from lpac.ground.rendering import (
     cell,
     facts,
     is_ready,
+    nose_rad,
     not_ready,
     problem,
     quantity,
@@ -118,7 +119,7 @@ def _robot_view(
         "state": status.state,
         "in_air": in_air(status),
         "position_m": _rounded(status.position_m),
-        "yaw_rad": _yaw_rad(status, heading_deg),
+        "yaw_rad": _number(nose_rad(status, heading_deg), 3),
         "wanted_m_s": _rounded(status.policy_velocity_m_s),
         "landing_m": _rounded(status.landing_point_m),
         # How old each neighbour's last message was then, by the neighbour's place in `robots`.
@@ -196,14 +197,6 @@ class Paths:
     def view(self) -> Json:
         """All of them, for a page that opens."""
         return {"kind": "paths", "paths": {name: list(p) for name, p in self._paths.items()}}
-
-
-def _yaw_rad(status: RobotStatus, heading_deg: float | None) -> float | None:
-    """The nose's direction on the map; None as long as nobody knows how the map lies."""
-    own = status.origin.heading_deg if status.origin is not None else heading_deg
-    if status.heading_rad is None or own is None:
-        return None
-    return _number(status.heading_rad - math.radians(own), 3)
 
 
 def _rounded(numbers: tuple[float, ...] | None) -> list[float] | None:

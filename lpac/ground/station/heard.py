@@ -5,13 +5,13 @@ program.
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from edge.core.arrivals import Arrivals
-from edge.messages.mission import FlightState, RadioCounts, RobotStatus
-from lpac.analysis.snapshot import FRESH_S, EventKind, RobotSnapshot
+from edge.messages.mission import RadioCounts, RobotStatus
+from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
 from lpac.ground.rendering import state_and_reason
 
 # Two statuses of one program, of which one is lost, are at most so far apart, unless it has ended.
@@ -20,14 +20,8 @@ _RATE_WINDOW_S = 3.0
 # In which a share of messages can be told.
 _ARRIVALS_WINDOW_S = 10.0
 
-
-class Tell(Protocol):
-    """Keeps an event for the clients."""
-
-    def __call__(
-        self, kind: EventKind, robot: str, text: str, operator: str = "",
-        state: FlightState | None = None,
-    ) -> None: ...  # fmt: skip
+# Keeps an event for the clients, as `Station.tell`.
+Tell = Callable[..., None]
 
 
 class _HeardStatus(NamedTuple):
