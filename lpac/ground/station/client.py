@@ -5,7 +5,7 @@ import os
 import socket
 import stat
 import tempfile
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Iterator
 from contextlib import aclosing, contextmanager
 from pathlib import Path
 
@@ -65,8 +65,8 @@ def command(
 @contextmanager
 def subscribe(fleet: str) -> Iterator[Iterator[ServerMessage]]:
     """Messages of the ground process from now on. Raises GroundError, also when it ends."""
-    with _connected(fleet, SUBSCRIBE) as answers:
-        yield answers
+    with _connected(fleet, SUBSCRIBE) as told:
+        yield told
 
 
 async def send(fleet: str, request: Request) -> CommandReport:
@@ -89,52 +89,49 @@ async def listen(fleet: str) -> AsyncIterator[ServerMessage]:
 def _connected(fleet: str, line: bytes) -> Iterator[Iterator[ServerMessage]]:
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(_PATIENCE_S)
-        try:
+        with _ground_errors(fleet):
             connection.connect(str(socket_path(fleet)))
-        except (FileNotFoundError, ConnectionRefusedError):
-            raise _not_running(fleet) from None
-        except (TimeoutError, BlockingIOError):  # More wait for it than it may have waiting.
-            raise no_answer(fleet) from None
+            connection.sendall(line)
         with connection.makefile("rb") as lines:
-            yield _read(fleet, connection, line, lines.readline)
+            yield _read(fleet, lines)
 
 
-def _read(
-    fleet: str, connection: socket.socket, line: bytes, readline: Callable[[], bytes]
-) -> Iterator[ServerMessage]:
-    try:
-        connection.sendall(line)
-        while answer := readline():
-            yield server_message_from_line(answer)
-    except TimeoutError:
-        raise no_answer(fleet) from None
-    except ConnectionError:
-        pass
+def _read(fleet: str, lines: Iterable[bytes]) -> Iterator[ServerMessage]:
+    with _ground_errors(fleet):
+        yield from map(server_message_from_line, lines)
     raise _ended(fleet)
 
 
 async def _answers(fleet: str, line: bytes) -> AsyncGenerator[ServerMessage]:
-    try:
+    with _ground_errors(fleet):
         reader, writer = await asyncio.open_unix_connection(socket_path(fleet), limit=MAX_LINE)
-    except (FileNotFoundError, ConnectionRefusedError):
-        raise _not_running(fleet) from None
-    try:
-        writer.write(line)
-        async with asyncio.timeout(_PATIENCE_S):
-            await writer.drain()
-        while True:
+        try:
+            writer.write(line)
             async with asyncio.timeout(_PATIENCE_S):
-                answer = await reader.readline()
-            if not answer:
-                break
-            yield server_message_from_line(answer)
-    except TimeoutError:
+                await writer.drain()
+            while True:
+                async with asyncio.timeout(_PATIENCE_S):
+                    answer = await reader.readline()
+                if not answer:
+                    break
+                yield server_message_from_line(answer)
+        finally:
+            writer.close()
+    raise _ended(fleet)
+
+
+@contextmanager
+def _ground_errors(fleet: str) -> Iterator[None]:
+    """Raises GroundError for what a socket raises."""
+    try:
+        yield
+    except (FileNotFoundError, ConnectionRefusedError):
+        text = f"no ground station runs for fleet {fleet} here: start `lpac ground`"
+        raise GroundError(text) from None
+    except (TimeoutError, BlockingIOError):  # More wait for it than it may have waiting.
         raise no_answer(fleet) from None
     except ConnectionError:
-        pass
-    finally:
-        writer.close()
-    raise _ended(fleet)
+        raise _ended(fleet) from None
 
 
 def _own_folder() -> Path:
@@ -152,10 +149,6 @@ def no_answer(fleet: str) -> GroundError:
         f"the ground station of fleet {fleet} does not answer: end it, and start `lpac ground` "
         "again"
     )
-
-
-def _not_running(fleet: str) -> GroundError:
-    return GroundError(f"no ground station runs for fleet {fleet} here: start `lpac ground`")
 
 
 def _ended(fleet: str) -> GroundError:

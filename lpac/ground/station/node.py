@@ -6,7 +6,8 @@
 import base64
 import math
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
@@ -108,10 +109,8 @@ class GroundNode:
 
     def _hear(self, key: str, data: bytes, speaker: Speaker) -> None:
         self._set_time()
-        try:
+        with self.surviving(key):
             self._receive(key, data, speaker)
-        except Exception as error:
-            self.survive(key, error)
 
     def tick(self) -> None:
         """Time has passed; some five times a second."""
@@ -120,26 +119,20 @@ class GroundNode:
         for robot_id in self._guard.robots_ahead():
             name = self._names.get(f"robot/{robot_id}", "")
             self._complain(f"ahead {robot_id}", name, _AHEAD)
-        try:
+        with self.surviving("tick"):
             self.station.tick()
             self._step()
-        except Exception as error:
-            self.survive("tick", error)
-        try:
+        with self.surviving("publish"):
             self._publish()
-        except Exception as error:
-            self.survive("publish", error)
 
     def begin(self, request: Request) -> CommandTask | None:
         """Begin a command; None if a defect kept it from beginning."""
         self._set_time()
-        try:
+        with self.surviving("command"):
             task = self.commands.begin(request)
             self._step()
-        except Exception as error:
-            self.survive("command", error)
-            return None
-        return task
+            return task
+        return None
 
     def abandon(self, task: CommandTask, why: str) -> None:
         """Whoever wanted it does not any more."""
@@ -228,12 +221,16 @@ class GroundNode:
             self._world_at_s = now_s
             self._link.publish(WORLD, world.encode())
 
-    def survive(self, what: str, error: Exception) -> None:
+    @contextmanager
+    def surviving(self, what: str) -> Iterator[None]:
         """Tell of a defect, and go on."""
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        place = f"{Path(where.filename).name}, line {where.lineno}"
-        text = f"a defect of lpac ground ({what}): {error!r} in {place}"
-        self._complain(f"defect {what}", "", text)
+        try:
+            yield
+        except Exception as error:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{Path(where.filename).name}, line {where.lineno}"
+            text = f"a defect of lpac ground ({what}): {error!r} in {place}"
+            self._complain(f"defect {what}", "", text)
 
     def _complain(self, key: str, robot: str, text: str) -> None:
         """Once for each key is enough."""

@@ -134,13 +134,11 @@ class GroundProcess:
                 with self._writing():
                     self._exchange()
             self._node.tick()
-            try:
+            with self._node.surviving("snapshot"):
                 if self._clients:
                     snapshot = to_line(self._node.snapshot)
                     for client in tuple(self._clients):
                         client.send(snapshot, may_be_missed=True)
-            except Exception as error:
-                self._node.survive("snapshot", error)
             now_s = time.monotonic()
             next_s = max(next_s + SNAPSHOT_PERIOD_S, now_s)
             await asyncio.sleep(next_s - now_s)
