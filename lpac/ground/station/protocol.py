@@ -172,12 +172,6 @@ Request = (
     | Resume | RobotCommand | NextTrial | TakeCommand
 )  # fmt: skip
 
-_NAMES_OF_COMMANDS: dict[type[Request], str] = {
-    SetOrigin: "origin", SetFence: "fence", SetWorld: "world", SetPlaces: "assign",
-    Takeoff: "takeoff", Start: "start", Resume: "resume", NextTrial: "again",
-    TakeCommand: "command",
-}  # fmt: skip
-
 
 def command_name(request: Request) -> str:
     """The name of a command in `lpac mission`."""
@@ -188,7 +182,7 @@ def command_name(request: Request) -> str:
             return request.action
         case RobotCommand():
             return request.kind
-    return _NAMES_OF_COMMANDS[type(request)]
+    return _NAMES[type(request)]
 
 
 def of_robots(name: str, robots: tuple[str, ...]) -> Request:
@@ -314,10 +308,10 @@ ServerMessage = (
 )
 
 _REQUESTS: dict[str, type[Request]] = {
-    "origin": SetOrigin, "fence": SetFence, "world": SetWorld, "places": SetPlaces,
+    "origin": SetOrigin, "fence": SetFence, "world": SetWorld, "assign": SetPlaces,
     "enable": Enable, "takeoff": Takeoff, "start": Start,
     "safety_command": SafetyCommand, "resume": Resume, "robot_command": RobotCommand,
-    "next_trial": NextTrial, "take_command": TakeCommand,
+    "again": NextTrial, "command": TakeCommand,
 }  # fmt: skip
 _ANSWERS: dict[str, type[ServerMessage]] = {
     "setup": FleetSetup, "snapshot": FleetSnapshot, "event": GroundEvent, "explored": Explored,
