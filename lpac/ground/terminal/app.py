@@ -121,6 +121,13 @@ class _Question(NamedTuple):
     request: Request
 
 
+_COMMAND = _Question("Take the command of the fleet?", "take command", TakeCommand())
+_QUESTIONS = {
+    "r": _Question("Withdraw hold, return and land, and fly on?", "resume", Resume()),
+    "c": _COMMAND, "C": _COMMAND,
+}  # fmt: skip
+
+
 class _Entered(NamedTuple):
     """Describe an event of a robot's new state."""
 
@@ -347,30 +354,21 @@ class Watch(App[str]):
     def on_key(self, event: Key) -> None:
         """Every key, in one place: hold comes before all else."""
         key = event.character if event.is_printable and event.character else event.key
-        one = self._selected if self._view == "robot" else ""
+        capital = key in ("H", "L") and self._view == "robot"
+        robots = (self._selected,) if capital else ()
+        whom = self._selected if capital else "the fleet"
         question, self._question = self._question, None
         if key in ("h", "H"):
-            whom = one if key == "H" else ""
-            self._send(f"hold {whom or 'the fleet'}", SafetyCommand("hold", _only(whom)))
+            self._send(f"hold {whom}", SafetyCommand("hold", robots))
         elif question is not None:
             self._message = Span("nothing done")
             if key in ("y", "Y"):
                 self._send(question.word, question.request)
         elif key in ("l", "L"):
-            whom = one if key == "L" else ""
-            self._question = _Question(
-                f"Land {whom or 'the WHOLE FLEET'} where it is?",
-                f"land {whom or 'the fleet'}",
-                SafetyCommand("land", _only(whom)),
-            )
-        elif key == "r":
-            self._question = _Question(
-                "Withdraw hold, return and land, and fly on?", "resume", Resume()
-            )
-        elif key in ("c", "C"):
-            self._question = _Question(
-                "Take the command of the fleet?", "take command", TakeCommand()
-            )
+            text = f"Land {self._selected if capital else 'the WHOLE FLEET'} where it is?"
+            self._question = _Question(text, f"land {whom}", SafetyCommand("land", robots))
+        elif key in _QUESTIONS:
+            self._question = _QUESTIONS[key]
         elif key == "q":
             self.exit()
         elif key == "t":
@@ -424,10 +422,6 @@ def _flying(snapshot: FleetSnapshot) -> bool:
 def _of_events() -> MissionTracker:
     """Tracker over events, in which a robot that flies on says nothing."""
     return MissionTracker(silent_s=math.inf)
-
-
-def _only(robot: str) -> tuple[str, ...]:
-    return (robot,) if robot else ()
 
 
 def _asked(question: _Question) -> Span:
