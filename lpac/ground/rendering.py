@@ -49,6 +49,12 @@ class Row(NamedTuple):
     alarm: Alarm | None = None
     setup: FleetSetup | None = None
 
+    @property
+    def said(self) -> RobotStatus:
+        """Its newest status, of a robot that was heard at some time."""
+        assert self.robot.status is not None
+        return self.robot.status
+
 
 def in_order(
     setup: FleetSetup,
@@ -120,12 +126,12 @@ def duration(value_s: float) -> str:
     return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes:02}:{seconds:02}"
 
 
-def _fence_margin_m(row: Row, status: RobotStatus) -> float | None:
+def _fence_margin_m(row: Row) -> float | None:
     """How far inside the fence's line, negative outside; of its own fence, if it tells it."""
-    fence = status.fence or (row.setup and row.setup.fence)
-    if not fence or status.position_m is None or not all(map(math.isfinite, status.position_m)):
+    position_m, fence = row.said.position_m, row.said.fence or (row.setup and row.setup.fence)
+    if not fence or position_m is None or not all(map(math.isfinite, position_m)):
         return None
-    return fence.distance_m(*status.position_m[:2])
+    return fence.distance_m(*position_m[:2])
 
 
 def fence_size(fence: Fence) -> str:
@@ -235,31 +241,28 @@ def _link(row: Row) -> Span:
     return Span(age(row.robot.age_s), "" if row.robot.fresh else "critical")
 
 
-def _state(_: Row, status: RobotStatus) -> Span:
-    return Span(state_word(status), state_look(status).style)
+def _state(row: Row) -> Span:
+    return Span(state_word(row.said), state_look(row.said).style)
 
 
-def _battery(row: Row, status: RobotStatus) -> Span:
-    if status.battery is None:
+def _battery(row: Row) -> Span:
+    battery = row.said.battery
+    if battery is None:
         return Span("-")
-    style: TextStyle = "warning" if status.battery <= BATTERY_LOW else ""
-    if row.setup is not None and status.battery <= row.setup.battery_critical:
+    style: TextStyle = "warning" if battery <= BATTERY_LOW else ""
+    if row.setup is not None and battery <= row.setup.battery_critical:
         style = "critical"
-    return Span(number(100.0 * status.battery, 3, 0), style)
+    return Span(number(100.0 * battery, 3, 0), style)
 
 
-def _satellites(_: Row, status: RobotStatus) -> Span:
-    if status.satellites is None:
-        return Span("-")
-    few = status.satellites < LIMITS.min_satellites
-    return Span(number(status.satellites, 3, 0), "warning" if few else "")
+def _satellites(row: Row) -> Span:
+    satellites = row.said.satellites
+    few = satellites is not None and satellites < LIMITS.min_satellites
+    return Span(number(satellites, 3, 0), "warning" if few else "")
 
 
-def _coordinate(axis: int, width: int) -> "_CellOf":
-    def of_status(_: Row, status: RobotStatus) -> Span:
-        return Span(number(status.position_m[axis] if status.position_m else None, width))
-
-    return of_status
+def _coordinate(axis: int, width: int) -> Callable[[Row], Span]:
+    return lambda row: Span(number(row.said.position_m and row.said.position_m[axis], width))
 
 
 def speed_m_s(status: RobotStatus) -> float | None:
@@ -267,23 +270,24 @@ def speed_m_s(status: RobotStatus) -> float | None:
     return None if status.velocity_m_s is None else math.hypot(*status.velocity_m_s)
 
 
-def _features(_: Row, status: RobotStatus) -> Span:
-    age_s = status.feature_age_s
-    old = age_s is not None and age_s > FEATURE_AGE_S and status.state in (_S.HOLD, _S.MISSION)
+def _features(row: Row) -> Span:
+    age_s = row.said.feature_age_s
+    old = age_s is not None and age_s > FEATURE_AGE_S and row.said.state in (_S.HOLD, _S.MISSION)
     return Span(age(age_s), "warning" if old else "")
 
 
-def _oldest(_: Row, status: RobotStatus) -> Span:
-    return Span(age(max(status.neighbour_ages_s.values(), default=None)))
-
-
-def _rate(row: Row, status: RobotStatus) -> Span:
-    rates_hz = [r for robot, r in row.robot.rates_hz.items() if robot in status.neighbour_ages_s]
+def _rate(row: Row) -> Span:
+    heard = row.said.neighbour_ages_s
+    rates_hz = [rate for robot, rate in row.robot.rates_hz.items() if robot in heard]
     return Span(number(sum(rates_hz) / len(rates_hz) if rates_hz else None, 3))
 
 
-def _lag(_: Row, status: RobotStatus) -> Span:
-    lag_ms = max((loop.lateness_p99_ms for loop in status.loops.values()), default=None)
+def _oldest(row: Row) -> Span:
+    return Span(age(max(row.said.neighbour_ages_s.values(), default=None)))
+
+
+def _lag(row: Row) -> Span:
+    lag_ms = max((loop.lateness_p99_ms for loop in row.said.loops.values()), default=None)
     late = lag_ms is not None and lag_ms > LATE_MS
     # Beyond a second with the unit, as an age has one beyond minutes.
     if lag_ms is not None and lag_ms >= 999.5:
@@ -291,14 +295,9 @@ def _lag(_: Row, status: RobotStatus) -> Span:
     return Span(number(lag_ms, 3), "warning" if late else "")
 
 
-def _margin(row: Row, status: RobotStatus) -> Span:
-    margin_m = _fence_margin_m(row, status)
+def _margin(row: Row) -> Span:
+    margin_m = _fence_margin_m(row)
     return Span(number(margin_m, 5), "critical" if margin_m is not None and margin_m < 0 else "")
-
-
-# Of a robot, whether it was heard or not; of what it said.
-_RobotCell = Callable[[Row], Span]
-_CellOf = Callable[[Row, RobotStatus], Span]
 
 
 class Column(NamedTuple):
@@ -309,38 +308,37 @@ class Column(NamedTuple):
     top: str
     unit: str
     width: int
-    of: _CellOf | None
+    of: Callable[[Row], Span]
     left: bool = False
 
 
-_OF_ROBOT: dict[str, _RobotCell] = {
-    "mark": _mark, "name": _name, "link": _link, "problem": problem,
-}  # fmt: skip
 # Left to right. At 80 columns, one of them for the scroll bar, ranks up to 8 have room: who reads
 # why a robot is as it is sees where it is on the map.
 COLUMNS = (
-    Column("mark", 0, "", "", 1, None, left=True),
-    Column("name", 1, "name", "", 4, None, left=True),
+    Column("mark", 0, "", "", 1, _mark, left=True),
+    Column("name", 1, "name", "", 4, _name, left=True),
     Column("state", 2, "state", "", 9, _state, left=True),
     Column("battery", 5, "bat", "%", 3, _battery),
     Column("satellites", 8, "GPS", "sat", 3, _satellites),
-    Column("mode", 6, "mode", "", 8, lambda _, s: Span(s.mode or "-"), left=True),
+    Column("mode", 6, "mode", "", 8, lambda row: Span(row.said.mode or "-"), left=True),
     Column("x", 9, "x", "m", 5, _coordinate(0, 5)),
     Column("y", 10, "y", "m", 5, _coordinate(1, 5)),
     Column("height", 7, "h", "m", 4, _coordinate(2, 4)),
-    Column("speed", 16, "v", "m/s", 3, lambda _, s: Span(number(speed_m_s(s), 3))),
+    Column("speed", 16, "v", "m/s", 3, lambda row: Span(number(speed_m_s(row.said), 3))),
     Column("features", 11, "feat", "s", 4, _features),
-    Column("neighbours", 12, "neigh", "n", 5, lambda _, s: Span(str(len(s.neighbour_ages_s)))),
+    Column("neighbours", 12, "neigh", "n", 5, lambda r: Span(str(len(r.said.neighbour_ages_s)))),
     Column("rate", 14, "", "Hz", 3, _rate),
     Column("oldest", 13, "", "s", 3, _oldest),
     Column("lag", 15, "lag", "ms", 3, _lag),
-    Column("link", 3, "link", "s", 4, None),
+    Column("link", 3, "link", "s", 4, _link),
     Column("margin", 17, "fence", "m", 5, _margin),
-    Column("bundle", 18, "bundle", "", ID, lambda _, s: Span(s.bundle_id[:ID]), left=True),
-    Column("world", 19, "world", "", ID, lambda _, s: Span(s.world_id[:ID]), left=True),
-    Column("problem", 4, "reason", "", 30, None, left=True),
+    Column("bundle", 18, "bundle", "", ID, lambda row: Span(row.said.bundle_id[:ID]), left=True),
+    Column("world", 19, "world", "", ID, lambda row: Span(row.said.world_id[:ID]), left=True),
+    Column("problem", 4, "reason", "", 30, problem, left=True),
 )
 COLUMN = {column.key: column for column in COLUMNS}
+# These are also of a robot that is not heard.
+_OF_ROBOT = ("mark", "name", "link", "problem")
 
 
 def cell(row: Row, column: str) -> Span:
@@ -359,12 +357,9 @@ def quantity(row: Row, column: str) -> Span:
 
 
 def _cell(row: Row, column: str) -> Span:
-    if column in _OF_ROBOT:
-        return _OF_ROBOT[column](row)
-    status, of = row.robot.status, COLUMN[column].of
-    if status is None or of is None:
+    if row.robot.status is None and column not in _OF_ROBOT:
         return Span(NOT_HEARD if column == "state" else "-", "faint")
-    return of(row, status)
+    return COLUMN[column].of(row)
 
 
 # All of a robot
@@ -432,7 +427,7 @@ def _program(row: Row, status: RobotStatus, ground: GroundState | None) -> dict[
     return {
         "landing": f"at x {x_m:.1f} m, y {y_m:.1f} m"
         + _told(", {:.1f} m away", away_m)
-        + _told("; fence margin {:.1f} m", _fence_margin_m(row, status)),
+        + _told("; fence margin {:.1f} m", _fence_margin_m(row)),
         "policy": _listed(
             _told("asks for {0[0]:.2f} {0[1]:.2f} m/s", status.policy_velocity_m_s) or "no answer",
             _told("features {:.1f} s old", status.feature_age_s) or "no features",

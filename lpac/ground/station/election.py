@@ -105,10 +105,10 @@ class Election:
         obeyed = [s.obeyed_sequence for s in self._robots.statuses().values()] or [0]
         return min(max(obeyed), max(statistics.median_low(obeyed), 0) + _MOST_OBEYED_AHEAD)
 
-    def take_command(self) -> None:
-        """Command from now on, with what the fleet is told already."""
-        if self.commands:
-            return
+    def take_command(self) -> GroundState:
+        """Command from now on, with what the fleet is told already; that state."""
+        if self.commands and self.state is not None:
+            return self.state
         operator, before = self._setup.operator, self._known_state()
         by = before.safety_action_by or before.operator
         self.state = replace(
@@ -119,6 +119,7 @@ class Election:
         )
         self.commands = True
         self._tell_commander(operator)
+        return self.state
 
     def remember(self, state: GroundState) -> None:
         """Take the last process's state: it counts if robots still obey just that."""

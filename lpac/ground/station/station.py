@@ -210,8 +210,7 @@ class Station:
         self.election.listen()
         if self.commands:
             self._asked = None
-            assert self.state is not None
-            way_home = self._homecoming.go_on(self.state)
+            way_home = self._homecoming.go_on(self.election.take_command())
             if way_home is not None:
                 self.change(**way_home._asdict())
         elif self._asked is not None:
@@ -222,12 +221,11 @@ class Station:
     def change(self, **changes: object) -> int:
         """Want something else of the fleet; the state's sequence. Takes the command."""
         election = self.election
-        election.take_command()
-        assert election.state is not None
-        after = replace(election.state, **changes)  # type: ignore[arg-type]
-        if after != election.state:
-            election.state = replace(after, sequence=election.state.sequence + 1)
-        return election.state.sequence
+        before = election.take_command()
+        after = replace(before, **changes)  # type: ignore[arg-type]
+        if after != before:
+            election.state = after = replace(after, sequence=before.sequence + 1)
+        return after.sequence
 
     def safety_action(
         self, safety_action: SafetyAction, robots: Collection[int] | None = None, by: str = ""
@@ -236,9 +234,7 @@ class Station:
 
         `by` is another station that wants it. Returns the sequence.
         """
-        self.election.take_command()
-        state = self.state
-        assert state is not None
+        state = self.election.take_command()
         these = frozenset(self._robots.names if robots is None else robots)
         self._homecoming.forget(these)
         if robots is None:
@@ -268,8 +264,7 @@ class Station:
 
     def _hold_as_commander(self, robots: Collection[int] | None) -> int:
         self.safety_action("hold", robots)
-        state, statuses = self.state, self._robots.statuses().values()
-        assert state is not None
+        state, statuses = self.election.take_command(), self._robots.statuses().values()
         # Robots may obey somebody who took over without being heard here.
         others = (s.obeyed_sequence for s in statuses if s.operator != self.operator)
         beyond = min(max(others, default=0), self.election.greatest_obeyed) + 1
