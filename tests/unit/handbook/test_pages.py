@@ -186,7 +186,7 @@ def test_interfaces_tell_calls_as_the_source_has_them() -> None:
         "TOLERANCE = 1e-5",
     ):
         assert f"```python\n{said}\n```" in text, said
-    assert "# Importance of what has not been seen yet.\nunknown_importance: NonNegative" in text
+    assert "# Importance of unseen cells.\nunknown_importance: NonNegative" in text
     for name in re.findall(r"`([A-Z]\w+(?:Driver|Family))`", _GUIDE.read_text()):
         assert f"### {name}\n" in text, name
     for module, name in interfaces.names():
