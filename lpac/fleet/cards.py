@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from edge.identity.card import Role
 from lpac.fleet.authority import Authority, AuthorityError, Member, create_authority, new_member
 from lpac.fleet.hold import Report, hold
-from lpac.fleet.program import start, stop
+from lpac.fleet.program import restart
 from lpac.fleet.session import Session
 from lpac.fleet.settings import FleetConfig, RobotHost
 
@@ -73,7 +73,7 @@ async def renew_card(config: FleetConfig, robot: RobotHost, report: Report) -> N
         made = await session.call("identity_key", fresh=True)
         await _write_card(session, authority, robot, made["public_key"], fresh=True)
         if found["service"]["active"] == "active":
-            await _restart(session, config, robot)
+            await restart(session, config, robot, in_flight=False)
 
 
 def has_group_keys(config: FleetConfig) -> bool:
@@ -101,13 +101,8 @@ async def give_group_keys(session: Session, config: FleetConfig, robot: RobotHos
         "set_group_keys", text=base64.b64encode(keys).decode(), mavlink_port=robot.mavlink_port
     )
     if (await session.call("service"))["active"] == "active":
-        await _restart(session, config, robot)
+        await restart(session, config, robot, in_flight=False)
     return True
-
-
-async def _restart(session: Session, config: FleetConfig, robot: RobotHost) -> None:
-    await stop(session, robot, in_flight=False, disable=False)
-    await start(session, config)
 
 
 async def _write_card(

@@ -1,7 +1,7 @@
 """A release's way to a robot: travel, be checked whole, prove itself, switch; or change nothing."""
 
 import json
-from collections.abc import Iterable, Set
+from collections.abc import Iterable, Sequence, Set
 from typing import Any, NamedTuple
 
 from lpac.fleet.hold import Held, Report, earlier_than, hold
@@ -66,8 +66,9 @@ async def deploy(
                 return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
         await require_disarmed(session, robot, "deploying")
         incoming = f"{config.directory}/incoming/{release.id}"
-        await _make_room(session, config, release, before, incoming)
-        sent_bytes = await _send(config, robot, release, held, incoming, report)
+        kept = await _make_room(session, config, release, before, incoming)
+        like = [f"--link-dest={config.directory}/releases/{name}" for name in kept]
+        sent_bytes = await _send(config, robot, release, held, incoming, like, report)
         steps = await _prove(session, release, incoming, report)
         report("switch", None)
         await require_disarmed(session, robot, "switching")
@@ -87,10 +88,10 @@ async def _is_whole(session: Session, folder: str) -> bool:
 
 async def _make_room(
     session: Session, config: FleetConfig, release: Release, found: dict[str, Any], incoming: str
-) -> None:
+) -> set[str]:
     """Make the folder to fill; what came of this release before it broke off is still there.
 
-    Raises RemoteError if the disk has no room.
+    The releases that are kept meanwhile. Raises RemoteError if the disk has no room.
     """
     await session.must("mkdir", "-p", incoming, f"{config.directory}/releases")
     others = ("-mindepth", "1", "-maxdepth", "1", "!", "-name", release.id, "-exec", "rm", "-rf")
@@ -98,12 +99,13 @@ async def _make_room(
     # One that did not run well may be left, or that a rollback left behind.
     names, number = found["releases"], found["number"]
     newer = next((name for name in names if name != number), None)
-    await _keep(session, config, names, {number, earlier_than(number, names) or newer})
+    kept = {number, earlier_than(number, names) or newer} - {None}
+    await _keep(session, config, names, kept)
     said = await session.look({
         "came": f"du -sb {incoming}", "free": f"df -B1 --output=avail {incoming} | tail -n 1",
     })  # fmt: skip
     needed_mb = _MARGIN_MB
-    if not any(its["image"] == release.image.id for its in found["releases"].values()):
+    if not any(names[name]["image"] == release.image.id for name in kept):
         needed_mb += max(0.0, release.size_bytes - float(said["came"].split()[0])) / 1e6
     free_mb = float(said["free"]) / 1e6
     if free_mb < needed_mb:
@@ -111,6 +113,7 @@ async def _make_room(
             f"the disk has {free_mb:.0f} MB free, and the release needs {needed_mb:.0f} MB: remove "
             "old logs, but not the newest (`lpac fleet pull`, then `lpac fleet exec`)"
         )
+    return kept
 
 
 async def _send(
@@ -119,13 +122,13 @@ async def _send(
     release: Release,
     held: Held,
     incoming: str,
+    like: Sequence[str],
     report: Report,
 ) -> int:
     """Have the release in `incoming`; how many bytes of content travelled.
 
-    Files that the robot has in another release, and that are whole there, are linked to.
+    `like` are rsync's options for releases on the robot: files that are whole there are linked to.
     """
-    like = [f"--link-dest={config.directory}/releases/{name}" for name in held.found["releases"]]
     try:
         return await rsync(
             config, robot, [f"{release.folder}/", str(release.image.folder)], f":{incoming}/",

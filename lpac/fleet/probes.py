@@ -3,7 +3,7 @@
 import json
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -42,58 +42,6 @@ print("yes")"""
 _DOCKER = """command -v docker > /dev/null || { echo '[]'; exit; }
 all=$(docker ps --all --quiet) || exit
 if [ "$all" ]; then docker inspect $all; else echo '[]'; fi"""
-
-_FACTS = {
-    "kernel": "uname -r",
-    "python": "python3 -V",
-    "rsync": "command -v rsync",
-    "systemd": "systemctl --version",
-    "sdk": "cat /etc/version",
-    "px4": "dpkg-query -W -f '${Version}' voxl-px4",
-    "memory": "cat /proc/meminfo",
-    "cpus": "nproc",
-    "load": "cat /proc/loadavg",
-    "hottest": 'for z in /sys/class/thermal/thermal_zone*; do echo $(cat $z/type $z/temp); done',
-    "clock": "timedatectl status --no-pager",
-    "wifi": _WIFI,
-    "vision_hub": f"cat {VISION_HUB}",
-    "containers": _DOCKER,
-    "card": f"cat {_IDENTITY}/identity.json",
-    "group_keys": f"sha256sum {_IDENTITY}/group-keys",
-    "open_ports": "ss -H -t -u -l -n -p",
-    "factory_passwords": _PASSWORDS,
-    "drops_strangers": f"python3 -c {shlex.quote(_FILTER)}",
-}  # fmt: skip
-
-
-async def facts(session: Session, directory: str, names: Sequence[str]) -> Facts:
-    """All that can be looked at; of the units, those with `names`."""
-    there = f"d={directory}; while [ ! -d ${{d:=/}} ]; do d=${{d%/*}}; done"
-    said = await session.look({**_FACTS, "disks": f"{there}; df -P -B1 $d /var/lib"})
-    python = re.search(r"[\d.]+", said["python"])
-    return {
-        "kernel": said["kernel"],
-        "python": python[0] if python else "0",
-        "rsync": bool(said["rsync"]),
-        "systemd": systemd_version(said["systemd"]),
-        "sdk": said["sdk"] or None,
-        "px4": said["px4"] or None,
-        "disks": disks_of(said["disks"]),
-        "memory": memory(said["memory"]),
-        "cpus": said["cpus"],
-        "load": number(said["load"].partition(" ")[0]) or 0.0,
-        "hottest_c": hottest_c(said["hottest"]),
-        "synchronized": synchronized(said["clock"]),
-        "wifi": wifi_of(said["wifi"]),
-        "vision_hub": vision_hub(said["vision_hub"]),
-        "containers": containers_of(said["containers"]),
-        "card": said["card"] or None,
-        "group_keys": said["group_keys"].partition(" ")[0] or None,
-        "open_ports": open_ports(said["open_ports"]),
-        "factory_passwords": said["factory_passwords"].split(),
-        "drops_strangers": said["drops_strangers"] == "yes",
-        "units": await units(session, names),
-    }
 
 
 async def wifi(session: Session) -> list[Facts]:
@@ -318,3 +266,43 @@ def number(text: str | None) -> float | None:
         return None if text is None else float(text)
     except ValueError:
         return None
+
+
+def _or_none(text: str) -> str | None:
+    return text or None
+
+
+async def facts(session: Session, directory: str, names: Sequence[str]) -> Facts:
+    """All that can be looked at; of the units, those with `names`."""
+    there = f"d={directory}; while [ ! -d ${{d:=/}} ]; do d=${{d%/*}}; done"
+    disks = f"{there}; df -P -B1 $d /var/lib"
+    said = await session.look({"disks": disks} | {name: its[0] for name, its in _FACTS.items()})
+    found: Facts = {name: its[1](said[name]) for name, its in _FACTS.items()}
+    return found | {"disks": disks_of(said["disks"]), "units": await units(session, names)}
+
+
+# What is printed, and how it is parsed.
+_FACTS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    "kernel": ("uname -r", str),
+    "python": ("python3 -V", lambda text: group(r"([\d.]+)", text) or "0"),
+    "rsync": ("command -v rsync", bool),
+    "systemd": ("systemctl --version", systemd_version),
+    "sdk": ("cat /etc/version", _or_none),
+    "px4": ("dpkg-query -W -f '${Version}' voxl-px4", _or_none),
+    "memory": ("cat /proc/meminfo", memory),
+    "cpus": ("nproc", str),
+    "load": ("cat /proc/loadavg", lambda text: number(text.partition(" ")[0]) or 0.0),
+    "hottest_c": (
+        "for z in /sys/class/thermal/thermal_zone*; do echo $(cat $z/type $z/temp); done",
+        hottest_c,
+    ),
+    "synchronized": ("timedatectl status --no-pager", synchronized),
+    "wifi": (_WIFI, wifi_of),
+    "vision_hub": (f"cat {VISION_HUB}", vision_hub),
+    "containers": (_DOCKER, containers_of),
+    "card": (f"cat {_IDENTITY}/identity.json", _or_none),
+    "group_keys": (f"sha256sum {_IDENTITY}/group-keys", lambda text: _or_none(text.split(" ")[0])),
+    "open_ports": ("ss -H -t -u -l -n -p", open_ports),
+    "factory_passwords": (_PASSWORDS, str.split),
+    "drops_strangers": (f"python3 -c {shlex.quote(_FILTER)}", bool),
+}

@@ -22,10 +22,28 @@ async def start(session: Session, config: FleetConfig) -> None:
 
     Raises RemoteError if it is not, or if a file of the release is not what it was when it came.
     """
-    current = f"{config.directory}/current"
-    if (await session.run("test", "-e", f"{current}/robot.toml")).code != 0:
+    await _require_whole(session, config)
+    await _start(session)
+
+
+async def restart(
+    session: Session, config: FleetConfig, robot: RobotHost, *, in_flight: bool
+) -> None:
+    """Stop the unit and start it again; as `stop` and `start`."""
+    # First what takes time: a vehicle may wait in the air.
+    await _require_whole(session, config)
+    await stop(session, robot, in_flight=in_flight, disable=False)
+    await _start(session)
+
+
+async def _require_whole(session: Session, config: FleetConfig) -> None:
+    current = f"{config.directory}/current/"
+    if (await session.run("test", "-e", f"{current}robot.toml")).code != 0:
         raise RemoteError("there is no release for a slot on this robot: deploy first")
-    await session.call("check", folder=f"{current}/")
+    await session.call("check", folder=current)
+
+
+async def _start(session: Session) -> None:
     await session.run("systemctl", "reset-failed", UNIT)
     await session.must("systemctl", "enable", UNIT)
     # A program that cannot start shows in its health, with the reason.

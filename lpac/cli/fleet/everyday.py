@@ -146,11 +146,10 @@ def restart(of: OfFleet, *, in_flight: InFlight = False) -> None:
     config, chosen = open_fleet(of.fleet, of.robots)
     chosen = _without_spares(config, chosen, "restarted")
 
-    async def again(session: "Session", robot: "RobotHost") -> None:
-        await program.stop(session, robot, in_flight=in_flight, disable=False)
-        await program.start(session, config)
-
-    _control(config, chosen, "restart", again, of.as_json)
+    _control(
+        config, chosen, "restart",
+        lambda at, robot: program.restart(at, config, robot, in_flight=in_flight), of.as_json,
+    )  # fmt: skip
 
 
 def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
