@@ -244,3 +244,10 @@ def test_a_class_name_means_one_thing() -> None:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+def test_what_runs_on_the_robots_own_python_is_one_file() -> None:
+    """All else of `lpac.fleet` is commands over SSH, and runs on the laptop; keys come next."""
+    fleet = ROOT / "lpac" / "fleet"
+    assert len((fleet / "agent.py").read_text().splitlines()) <= 500
+    assert {path.name for path in fleet.glob("on_robot/*.py")} <= {"__init__.py", "enrolment.py"}
