@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from edge.flight.preflight import failed_checks
 from edge.messages import codes
@@ -118,7 +119,7 @@ def test_a_robot_flies_the_same(wordless: Wordless) -> None:
 def failed() -> list[FailedCheck]:
     """Everything that preflight knows."""
     changes = [change for change, _, _ in INPUTS + POSITIONS]
-    changes += [{"vehicle": replace(VEHICLE, **change)} for change, _, _ in VEHICLES]
+    changes += [{"vehicle": structs.replace(VEHICLE, **change)} for change, _, _ in VEHICLES]
     return [check for c in changes for check in failed_checks(replace(READY, **c), LIMITS)]
 
 
