@@ -9,8 +9,10 @@ import numpy as np
 
 from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters
+from edge.core.ports import OdometrySource
 from edge.core.world import Feature, rasterize
 from edge.drivers.registry import load_policy
+from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Bundle
 from edge.robot.pac import PacParameters
 from lpac.analysis.coverage import Coverage
@@ -20,7 +22,7 @@ from lpac.sim.baselines import BaselineSwarm, make_baseline
 from lpac.sim.failure import alive_at
 from lpac.sim.medium import Medium
 from lpac.sim.scenario import Scenario
-from lpac.sim.swarm import ClockedPac, Swarm, pac_swarm
+from lpac.sim.swarm import AnyRobot, ClockedPac, Swarm
 from lpac.sim.vehicles import PointVehicles
 
 SAMPLE_S = 0.2
@@ -47,6 +49,24 @@ class Preparation:
     times_s: list[float]
     clock_rng: np.random.Generator
     medium: Medium
+
+    def vehicles(self) -> PointVehicles:
+        """The vehicles at their starts."""
+        scenario = self.scenario
+        side_m = self.perception.world_size / scenario.scale.env_scale
+        return PointVehicles(self.starts_m, side_m, scenario.lag_s)
+
+    def swarm(self, boot: Callable[[int, int, OdometrySource], AnyRobot]) -> Swarm[AnyRobot]:
+        """The robots at their starts; see `Swarm`."""
+        return Swarm(
+            boot=boot,
+            vehicles=self.vehicles(),
+            medium=self.medium,
+            rng=self.clock_rng,
+            clocks=self.scenario.clocks,
+            failures=self.scenario.failures,
+            bias_m=self.bias_m,
+        )
 
     def until(self, time_s: float) -> "Preparation":
         """The same of a flight that ends with that sample. Raises ValueError at its start."""
@@ -248,29 +268,16 @@ def fly_points(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -
     if not isinstance(bundle, Bundle):
         raise ValueError(f"{bundle}: is no bundle in memory: load_bundle gives one of a path")
     prepared = prepare(scenario, bundle)
-    perception, parameters = prepared.perception, prepared.parameters
     swarm: Swarm[ClockedPac] | BaselineSwarm
     if scenario.controller == "lpac":
-        swarm = pac_swarm(
-            policy=load_policy(prepared.bundle),
-            importance=prepared.importance,
-            positions_m=prepared.starts_m,
-            parameters=parameters,
-            medium=prepared.medium,
-            rng=prepared.clock_rng,
-            clocks=scenario.clocks,
-            failures=scenario.failures,
-            bias_m=prepared.bias_m,
-            lag_s=scenario.lag_s,
-        )
+        swarm = prepared.swarm(_boot_of(prepared))
     else:
+        perception, importance = prepared.perception, prepared.importance
         swarm = BaselineSwarm(
-            make_baseline(scenario.controller, prepared.importance, perception, scenario.robots),
-            PointVehicles(
-                prepared.starts_m, perception.world_size / scenario.scale.env_scale, scenario.lag_s
-            ),
+            make_baseline(scenario.controller, importance, perception, scenario.robots),
+            prepared.vehicles(),
             scenario.scale,
-            parameters.max_speed_m_s,
+            prepared.parameters.max_speed_m_s,
             prepared.bias_m,
             perception.world_size,
         )
@@ -286,6 +293,24 @@ def fly_points(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -
             prepared = prepared.until(time_s)
             break
     return prepared.record(np.array(positions), swarm.message_counts(), swarm.largest_payload)
+
+
+def _boot_of(prepared: Preparation) -> Callable[[int, int, OdometrySource], ClockedPac]:
+    """Starts of robots with the code of real ones; see `Swarm`."""
+    policy = load_policy(prepared.bundle)
+    sensor = WorldSensor(prepared.importance, prepared.perception.sensor_size)
+
+    def boot(robot: int, start: int, odometry: OdometrySource) -> ClockedPac:
+        return ClockedPac(
+            start=start,
+            robot_id=robot,
+            policy=policy,
+            sensor=sensor,
+            odometry=odometry,
+            parameters=prepared.parameters,
+        )
+
+    return boot
 
 
 def cost_times_s(duration_s: float) -> F64:

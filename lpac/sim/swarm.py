@@ -9,15 +9,12 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from edge.core import F32, F64, Bools
+from edge.core import F64, Bools
 from edge.core.part import PartError
 from edge.core.ports import OdometrySource
-from edge.drivers.world_sensor import WorldSensor
 from edge.messages.beacon import Beacon
-from edge.policy.bundle import BundleError
-from edge.policy.family import Policy
 from edge.robot.neighbours import NeighbourTable, Number
-from edge.robot.pac import Pac, PacParameters
+from edge.robot.pac import Pac
 from lpac.sim.failure import Failure
 from lpac.sim.medium import Medium
 from lpac.sim.ticks import Clocks, ticks
@@ -44,16 +41,16 @@ class SwarmRobot(Protocol):
         """Take in another's message."""
 
 
-_Robot = TypeVar("_Robot", bound=SwarmRobot)
+AnyRobot = TypeVar("AnyRobot", bound=SwarmRobot)
 
 
-class Swarm(Generic[_Robot]):
+class Swarm(Generic[AnyRobot]):
     """N robots, each with its own clocks; deterministic for a seed."""
 
     def __init__(
         self,
         *,
-        boot: Callable[[int, int, OdometrySource], _Robot],
+        boot: Callable[[int, int, OdometrySource], AnyRobot],
         vehicles: PointVehicles,
         medium: Medium,
         rng: np.random.Generator,
@@ -73,7 +70,7 @@ class Swarm(Generic[_Robot]):
         robots = len(vehicles.positions_m())
         self._boots = [0] * robots
         self.robots = [self._booted(robot) for robot in range(robots)]
-        self._gone: list[_Robot] = []
+        self._gone: list[AnyRobot] = []
         self._failed: set[int] = set()
         # Events (time, order, what to do) beside the ticks; the order makes equal times
         # deterministic.
@@ -160,7 +157,7 @@ class Swarm(Generic[_Robot]):
             counts.update(robot.table.counts())
         return dict(counts)
 
-    def _booted(self, robot: int) -> _Robot:
+    def _booted(self, robot: int) -> AnyRobot:
         self._boots[robot] += 1
         bias_m = None if self._bias_m is None else self._bias_m[robot]
         odometry = VehicleOdometry(self._vehicles, robot, bias_m)
@@ -232,49 +229,3 @@ class ClockedPac(Pac):
 
     def _tell_time(self, now_s: float) -> None:
         self.clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)
-
-
-def pac_swarm(
-    *,
-    policy: Policy,
-    importance: F32,
-    positions_m: F64,
-    parameters: PacParameters,
-    medium: Medium,
-    rng: np.random.Generator,
-    clocks: Clocks,
-    failures: Sequence[Failure] = (),
-    bias_m: F64 | None = None,
-    lag_s: float = 0.0,
-) -> Swarm[ClockedPac]:
-    """Robots that run what a real one runs, over the world of `importance`.
-
-    `positions_m` (N, 2) are the starting positions, `lag_s` is that of `PointVehicles`; the rest is
-    as `Swarm` has it. Raises BundleError if the policy has no perception.
-    """
-    perception = policy.manifest.perception
-    if perception is None:
-        raise BundleError(f"bundle {policy.manifest.name!r} has no perception to simulate")
-    sensor = WorldSensor(importance, perception.sensor_size)
-
-    def boot(robot: int, start: int, odometry: OdometrySource) -> ClockedPac:
-        return ClockedPac(
-            start=start,
-            robot_id=robot,
-            policy=policy,
-            sensor=sensor,
-            odometry=odometry,
-            parameters=parameters,
-        )
-
-    return Swarm(
-        boot=boot,
-        vehicles=PointVehicles(
-            positions_m, perception.world_size / parameters.scale.env_scale, lag_s
-        ),
-        medium=medium,
-        rng=rng,
-        clocks=clocks,
-        failures=failures,
-        bias_m=bias_m,
-    )

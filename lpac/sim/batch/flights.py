@@ -23,7 +23,6 @@ from lpac.sim.batch.seen import ShownWorld
 from lpac.sim.points import Preparation, WorldMoment, prepare
 from lpac.sim.scenario import Scenario
 from lpac.sim.swarm import Swarm
-from lpac.sim.vehicles import PointVehicles
 
 
 class PolicyInputs(NamedTuple):
@@ -112,20 +111,9 @@ class BatchedFlights:
         self._deferred.compute()
 
     def _swarm(self, world: Preparation, first_agent: int) -> Swarm[BatchedRobot]:
-        scenario, perception = world.scenario, world.perception
-        shown = ShownWorld(world.importance, perception)
-        local_map = np.empty((perception.local_map_size,) * 2, np.float32)
-        return Swarm(
-            boot=partial(self._boot, world.parameters, shown, local_map, first_agent),
-            vehicles=PointVehicles(
-                world.starts_m, perception.world_size / scenario.scale.env_scale, scenario.lag_s
-            ),
-            medium=world.medium,
-            rng=world.clock_rng,
-            clocks=scenario.clocks,
-            failures=scenario.failures,
-            bias_m=world.bias_m,
-        )
+        shown = ShownWorld(world.importance, world.perception)
+        local_map = np.empty((world.perception.local_map_size,) * 2, np.float32)
+        return world.swarm(partial(self._boot, world.parameters, shown, local_map, first_agent))
 
     def _boot(
         self,
