@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.fields import options_of
+from lpac.cli.fields import chosen, options_of
 from lpac.cli.options import (
     DEFAULT_BUNDLE,
     AsJson,
@@ -38,17 +38,6 @@ _QUICK_NETWORK = (3, 1, 8.0)
 _Out = Annotated[
     Path | None,
     typer.Option(help="Folder for figures, data and README.md; out/paper/NAME if none."),
-]
-_Worlds = Annotated[
-    int | None,
-    typer.Option(
-        "--worlds", "-k",
-        help="How many of the validation set, from the first on; else as the study has it, "
-        "and a fifth of it, or one in real time, for whole robots in `async` and `transfer`.",
-    ),
-]  # fmt: skip
-_World = Annotated[
-    int | None, typer.Option(help="Number of the world, of the validation set; else 0.")
 ]
 _Quick = Annotated[bool, typer.Option("--quick", help="A small version that takes minutes.")]
 _Namespaces = Annotated[
@@ -93,115 +82,110 @@ class ExperimentOptions:
     out: _Out = None
 
 
-@app.command()
-@options_of(ExperimentOptions)
-def e1(flown: ExperimentOptions, *, worlds: _Worlds = None) -> None:
-    """Transferability: unseen worlds from the same starts, beside baselines."""
-    _experiment("e1", flown, {"worlds": worlds})
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Changes:
+    """Changes of an experiment; it stays as it is where an option is None."""
 
-
-@app.command()
-@options_of(ExperimentOptions)
-def e2(
-    flown: ExperimentOptions,
-    *,
-    trials: Annotated[int | None, typer.Option(help="How many trials; else 3.")] = None,
-    world: _World = None,
-) -> None:
-    """Repeatability: one world again and again, starts and GPS a little off."""
-    if trials is not None and trials < 2:
-        raise ValueError(f"--trials {trials}: must be at least 2")
-    _experiment("e2", flown, {"trials": trials, "first_world": world})
-
-
-@app.command()
-@options_of(ExperimentOptions)
-def e3(flown: ExperimentOptions, *, world: _World = None) -> None:
-    """Perturbation: robots are taken away at steady state, and brought back."""
-    _experiment("e3", flown, {"first_world": world})
-
-
-@app.command("async")
-@options_of(ExperimentOptions)
-def asynchrony(flown: ExperimentOptions, *, worlds: _Worlds = None, quick: _Quick = False) -> None:
-    """Rates of perception and of messages, in step or not, and late messages: what they cost."""
-    _experiment("async", flown, {"worlds": worlds}, quick=quick)
-
-
-@app.command()
-@options_of(ExperimentOptions)
-def transfer(
-    flown: ExperimentOptions,
-    *,
-    worlds: _Worlds = None,
+    worlds: Annotated[
+        int | None,
+        typer.Option(
+            "--worlds", "-k",
+            help="How many of the validation set, from the first on; else as the study has it, "
+            "and a fifth of it, or one in real time, for whole robots in `async` and `transfer`.",
+        ),
+    ] = None  # fmt: skip
+    trials: Annotated[int | None, "How many trials; else 3."] = None
+    world: Annotated[int | None, "Number of the world, of the validation set; else 0."] = None
     set_ups: Annotated[
         list[str] | None,
         typer.Option(
             "--set-up", metavar="NAME", help="Only this one (docs/research.md); may be repeated."
         ),
-    ] = None,
-    quick: _Quick = False,
-) -> None:
-    """Other numbers of robots, features and ranges: `lpac evaluate` in the paper's set-ups."""
-    _experiment("transfer", flown, {"worlds": worlds, "set_ups": set_ups}, quick=quick)
+    ] = None
+    quick: _Quick = False
 
 
-_OPTIONS = {"worlds": "--worlds", "trials": "--trials", "first_world": "--world",
-            "set_ups": "--set-up"}  # fmt: skip
+def _add(name: str, about: str, *changes: str) -> Callable[..., None]:
+    """Add the command of an experiment, with these fields of `Changes` as options."""
+
+    @options_of(ExperimentOptions, chosen(Changes, *changes))
+    def command(options: ExperimentOptions, given: Any) -> None:
+        changed = {each: getattr(given, each) for each in changes}
+        _experiment(name, options, Changes(**changed))
+
+    app.command(name, help=about)(command)
+    return command
 
 
-def _experiment(
-    name: str, options: ExperimentOptions, changes: Mapping[str, Any], *, quick: bool = False
-) -> None:
-    """Fly it, or read it from logs. `changes` are what else was given, or None."""
-    given = {key: value for key, value in changes.items() if value is not None}
-    _check(name, options, given, quick=quick)
+e1 = _add("e1", "Transferability: unseen worlds from the same starts, beside baselines.", "worlds")
+e2 = _add(
+    "e2", "Repeatability: one world again and again, starts and GPS a little off.",
+    "trials", "world",
+)  # fmt: skip
+e3 = _add("e3", "Perturbation: robots are taken away at steady state, and brought back.", "world")
+asynchrony = _add(
+    "async", "Rates of perception and of messages, in step or not, and late messages: what they "
+    "cost.", "worlds", "quick",
+)  # fmt: skip
+transfer = _add(
+    "transfer", "Other numbers of robots, features and ranges: `lpac evaluate` in the paper's "
+    "set-ups.", "worlds", "set_ups", "quick",
+)  # fmt: skip
+
+
+def _experiment(name: str, options: ExperimentOptions, changes: Changes) -> None:
+    """Fly it, or read it from logs."""
+    _check(name, options, changes)
     if options.logs is not None:
         _from_logs(name, options.logs, options)
         return
-    task = _task(name, options, given, quick=quick)
+    task = _task(name, options, changes)
     fly_study(task, options.ray, as_json=options.as_json)
     (task.folder / _MADE_FOR_ALL).unlink(missing_ok=True)
 
 
-def _task(
-    name: str, options: ExperimentOptions, given: Mapping[str, Any], *, quick: bool
-) -> StudyTask:
-    """The experiment, changed as `given`; and the command that repeats it."""
+def _task(name: str, options: ExperimentOptions, changes: Changes) -> StudyTask:
+    """The changed experiment; and the command that repeats it."""
     from lpac.paper.experiments import experiment
 
     bundles, vehicle = options.bundles or [DEFAULT_BUNDLE], options.vehicle
-    changes = dict(given)
     study = experiment(
-        name, bundles, engine=vehicle.value, px4_build=options.px4, quick=quick,
-        set_ups=changes.pop("set_ups", ()),
+        name, bundles, engine=vehicle.value, px4_build=options.px4, quick=changes.quick,
+        set_ups=changes.set_ups or (),
     )  # fmt: skip
+    numbers = {"worlds": changes.worlds, "trials": changes.trials, "first_world": changes.world}
+    given: dict[str, Any] = {k: number for k, number in numbers.items() if number is not None}
     words = ["paper", name]
     words += [] if vehicle is VehicleKind.POINT else ["--vehicle", vehicle.value]
-    words += [word for key, value in changes.items() for word in (_OPTIONS[key], str(value))]
-    words += [word for its in given.get("set_ups", ()) for word in ("--set-up", its)]
+    for key, number in given.items():
+        words += [f"--{key.removeprefix('first_')}", str(number)]
+    words += [word for its in changes.set_ups or () for word in ("--set-up", its)]
     words += [word for its in bundles if its != DEFAULT_BUNDLE for word in ("--bundle", str(its))]
-    words += ["--quick"] if quick else []
+    words += ["--quick"] if changes.quick else []
     return StudyTask(
-        name=name, study=replace(study, **changes), folder=options.out or _OUT / name,
+        name=name, study=replace(study, **given), folder=options.out or _OUT / name,
         command=shlex.join(words),
     )  # fmt: skip
 
 
-def _check(name: str, options: ExperimentOptions, given: Mapping[str, Any], *, quick: bool) -> None:
-    """Raise ValueError for an option that would do nothing."""
+def _check(name: str, options: ExperimentOptions, changes: Changes) -> None:
+    """Raise ValueError for an option that would do nothing, or is impossible."""
+    if changes.trials is not None and changes.trials < 2:
+        raise ValueError(f"--trials {changes.trials}: must be at least 2")
     for path in options.bundles or ():
         found(path)
     if len(options.bundles or ()) > 1 and (name != "transfer" or options.logs is not None):
         raise ValueError("one bundle flew, so give --bundle once")
     if options.logs is not None:
-        flying = [_OPTIONS[key] for key in given]
-        flying += ["--quick"] if quick else []
-        flying += ["--ray"] if options.ray is not None else []
-        flying += ["--vehicle"] if options.vehicle is not VehicleKind.POINT else []
-        flying += ["--px4"] if options.px4 is not None else []
-        if flying:
-            raise ValueError(f"{flying[0]} does nothing with --logs")
+        flying = {
+            "--worlds": changes.worlds, "--trials": changes.trials, "--world": changes.world,
+            "--set-up": changes.set_ups, "--quick": changes.quick or None, "--ray": options.ray,
+            "--vehicle": None if options.vehicle is VehicleKind.POINT else options.vehicle,
+            "--px4": options.px4,
+        }  # fmt: skip
+        for flag, value in flying.items():
+            if value is not None:
+                raise ValueError(f"{flag} does nothing with --logs")
         return
     check_px4(options.vehicle, options.px4)
     require_here(options.vehicle, options.ray)
@@ -342,7 +326,7 @@ def _task_of_all(name: str, bundle: Path, folder: Path, *, quick: bool) -> Study
         bundles=[bundle], out=folder / name,
         vehicle=VehicleKind.SIMULATED if whole else VehicleKind.POINT,
     )  # fmt: skip
-    return _task(name, options, {}, quick=quick and not of_few_flights)
+    return _task(name, options, Changes(quick=quick and not of_few_flights))
 
 
 def _is_made(folder: Path, made_by: Mapping[str, str]) -> bool:

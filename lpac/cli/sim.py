@@ -4,7 +4,8 @@ import gc
 import json
 import shlex
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -134,6 +135,11 @@ class FlightOptions:
     wifi: WifiFile = None
 
 
+# Options of a scenario's fields, where these are not the field's name.
+_NAMED = {"random_feature_count": "--features", "communication_range": "--range"}
+_FLAGS = {**_NAMED, "failures": "--lost", "radio": "--transport", "clocks": "--policy-hz"}
+
+
 def _of_scenario() -> type[Any]:
     """Options that are a scenario's own fields."""
     from lpac.sim.scenario import Scenario
@@ -141,7 +147,7 @@ def _of_scenario() -> type[Any]:
     return chosen(
         Scenario, "controller", "seed", "duration_s", "world_size", "lag_s", "position_error_m",
         "payload", "loss", "delay_s", "max_message_age_s", "errors", "wind_m_s", "sensor", "secure",
-        random_feature_count="--features", communication_range="--range",
+        **_NAMED,
     )  # fmt: skip
 
 
@@ -156,7 +162,10 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
     check_px4(run.vehicle, run.px4)
     count = _robot_count(drawn.robots, run.vehicle)
     scenario = _scenario(run, drawn, of_scenario, count)
-    _require_able(scenario, run)
+    from lpac.sim.engines import engine_of
+
+    with _told_as_option(f"--vehicle {run.vehicle.value}"):
+        engine_of(run.vehicle.value, run.px4).require_able(scenario)
     if run.out:
         run.out.mkdir(parents=True, exist_ok=True)
     if run.vehicle is VehicleKind.POINT:
@@ -176,23 +185,16 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
         raise typer.Exit(1)
 
 
-def _require_able(scenario: "Scenario", run: RunOptions) -> None:
-    """Raise ValueError that names the option which does nothing with these vehicles."""
-    from lpac.sim.engines import engine_of
+@contextmanager
+def _told_as_option(beside: str) -> Iterator[None]:
+    """Raise ValueError that names the option of a field which does nothing beside another."""
     from lpac.sim.scenario import UnableError
 
     try:
-        engine_of(run.vehicle.value, run.px4).require_able(scenario)
+        yield
     except UnableError as error:
-        beside = f"--vehicle {run.vehicle.value}"
-        raise ValueError(f"{_flag(error.name)} does nothing with {beside}") from None
-
-
-def _flag(name: str) -> str:
-    """The option of a scenario's field."""
-    others = {"random_feature_count": "--features", "communication_range": "--range",
-              "failures": "--lost", "radio": "--transport", "clocks": "--policy-hz"}  # fmt: skip
-    return others.get(name, flag_of(name))
+        flag = _FLAGS.get(error.name, flag_of(error.name))
+        raise ValueError(f"{flag} does nothing with {beside}") from None
 
 
 def _scenario(
@@ -229,23 +231,14 @@ def _scenario(
         **{name: getattr(of_scenario, name) for name in of_scenario.__dataclass_fields__},
     )
     if scenario.controller != "lpac":
-        _require_of_baselines(scenario)
+        # A baseline senses and decides at once, and nothing is sent.
+        with _told_as_option(f"--controller {scenario.controller}"):
+            scenario.require_default(
+                "baselines", "clocks", "payload", "loss", "delay_s", "max_message_age_s"
+            )
     if drawn.starts is None:
         return scenario
     return replace(scenario, starts_m=_starts(drawn.starts, count, run.bundle, scenario))
-
-
-def _require_of_baselines(scenario: "Scenario") -> None:
-    """A baseline senses and decides at once, and nothing is sent."""
-    from lpac.sim.scenario import UnableError
-
-    try:
-        scenario.require_default(
-            "baselines", "clocks", "payload", "loss", "delay_s", "max_message_age_s"
-        )
-    except UnableError as error:
-        beside = f"--controller {scenario.controller}"
-        raise ValueError(f"{_flag(error.name)} does nothing with {beside}") from None
 
 
 def _failures(drawn: FlightOptions, robots: int, duration_s: float) -> tuple["Failure", ...]:
