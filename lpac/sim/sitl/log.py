@@ -12,9 +12,7 @@ from edge.core import F64, Bools
 from lpac.analysis.ulog import Topic, read_topics
 from lpac.sim.px4.world import WorldOrigin
 
-_PLACE, _ATTITUDE, _STATUS = (
-    "vehicle_local_position_groundtruth", "vehicle_attitude_groundtruth", "vehicle_status",
-)  # fmt: skip
+_PLACE, _STATUS = "vehicle_local_position_groundtruth", "vehicle_status"
 _ESTIMATE, _SETPOINT = "vehicle_local_position", "offboard_control_mode"
 _ARMED = 2
 
@@ -24,15 +22,13 @@ class Px4Truth:
     """Truth in the log; times are PX4's own, s since it started, ascending.
 
     `position_m` and `velocity_m_s` (T, 3) are north, east, down in the world, heights from where
-    the vehicle stood; `heading_rad` (T,) clockwise from north. `velocity_error_m_s` (T,) is how
-    wrong PX4's estimate of the horizontal velocity was. `status_s` (S,) are the times from which on
-    `navigation_state` and `armed` (S,) held.
+    the vehicle stood. `velocity_error_m_s` (T,) is the error of PX4's estimated horizontal
+    velocity. `status_s` (S,) are the times from which on `navigation_state` and `armed` (S,) held.
     """
 
     time_s: F64
     position_m: F64
     velocity_m_s: F64
-    heading_rad: F64
     velocity_error_m_s: F64
     status_s: F64
     navigation_state: npt.NDArray[np.int64]
@@ -51,7 +47,7 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
 
     A log that ends in the middle, as of a PX4 that was killed, is read as far as it goes.
     """
-    logs = [read_topics(path, (_PLACE, _ATTITUDE, _ESTIMATE, _STATUS)) for path in paths]
+    logs = [read_topics(path, (_PLACE, _ESTIMATE, _STATUS)) for path in paths]
     places = [topics[_PLACE] for topics in logs if _PLACE in topics]
     if not places:
         return None
@@ -72,13 +68,11 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
     statuses = [topics[_STATUS] for topics in logs if _STATUS in topics]
     status_s = _joined([s["timestamp"] for s in statuses]) * 1e-6
     status_order = np.argsort(status_s, kind="stable")
-    attitudes = [topics[_ATTITUDE] for topics in logs if _ATTITUDE in topics]
     estimates = [topics[_ESTIMATE] for topics in logs if _ESTIMATE in topics]
     return Px4Truth(
         time_s=time_s[order],
         position_m=position_m[order],
         velocity_m_s=velocity_m_s[order],
-        heading_rad=_headings_rad(attitudes, time_s[order]),
         velocity_error_m_s=_velocity_errors_m_s(estimates, time_s[order], velocity_m_s[order]),
         status_s=status_s[status_order],
         navigation_state=_joined([s["nav_state"] for s in statuses])[status_order].astype(np.int64),
@@ -97,16 +91,6 @@ def read_setpoints(paths: Sequence[Path]) -> Px4Setpoints:
 
 def _joined(parts: Sequence[npt.NDArray[Any]]) -> F64:
     return np.concatenate([np.zeros(0), *parts])
-
-
-def _headings_rad(attitudes: Sequence[Topic], time_s: F64) -> F64:
-    """At these times; 0 where nothing is known."""
-    at_s = _joined([attitude["timestamp"] for attitude in attitudes]) * 1e-6
-    if len(at_s) == 0:
-        return np.zeros(len(time_s))
-    w, x, y, z = (_joined([a[f"q[{i}]"] for a in attitudes]) for i in range(4))
-    headings_rad = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-    return np.interp(time_s, at_s, headings_rad)
 
 
 def _velocity_errors_m_s(estimates: Sequence[Topic], time_s: F64, velocity_m_s: F64) -> F64:
