@@ -1,6 +1,5 @@
 """`lpac drill`: faults in flight, and whether what is promised then holds."""
 
-import json
 import shlex
 import signal
 import sys
@@ -145,12 +144,9 @@ def _tell(outcomes: "Outcomes", folder: Path, *, as_json: bool) -> None:
 
     bundle_id = next(iter(outcomes)).flown_by
     report = report_of(outcomes, made_by(shlex.join(sys.argv[1:]), [bundle_id]))
-    told = report.write(folder)
+    report.write(folder)
     (folder / "drill.xml").write_bytes(as_junit(outcomes))
-    if as_json:
-        typer.echo(json.dumps(told, indent=2))
-    else:
-        show_report(report, folder)
+    show_report(report, folder, as_json=as_json)
 
 
 def _list(names: Sequence[str]) -> None:

@@ -212,11 +212,8 @@ def _from_logs(name: str, logs: Path, options: ExperimentOptions) -> None:
             made_by=made_by(shlex.join(words), ids_in(records)), pool=pool(None), note=_note,
         )
     )  # fmt: skip
-    told = report.write(folder)
-    if options.as_json:
-        typer.echo(json.dumps(told, indent=2))
-    else:
-        show_report(report, folder)
+    report.write(folder)
+    show_report(report, folder, as_json=options.as_json)
 
 
 def _missions(

@@ -81,11 +81,8 @@ class StudyTask:
 def fly_study(task: StudyTask, ray: str | None, *, as_json: bool) -> None:
     """Fly a study, write its report, and print it."""
     [report] = fly_together([task], task.folder, ray)
-    if as_json:
-        typer.echo(json.dumps(report.document, indent=2))
-        return
-    show_report(report, task.folder)
-    if (opened := report.data["test_set_opened"]) is not None:
+    show_report(report, task.folder, as_json=as_json)
+    if not as_json and (opened := report.data["test_set_opened"]) is not None:
         beside = "if you choose by this, it is no test set any more"
         typer.echo(f"the test set was opened, {opened['worlds']} worlds of it: {beside}")
 
@@ -126,8 +123,11 @@ def _written(task: StudyTask, flown: "Flown") -> "Report":
     return report
 
 
-def show_report(report: "Report", folder: Path) -> None:
-    """The tables of a report on the terminal."""
+def show_report(report: "Report", folder: Path, *, as_json: bool = False) -> None:
+    """Print a report: its tables, or its JSON."""
+    if as_json:
+        typer.echo(json.dumps(report.document, indent=2))
+        return
     for table in report.tables:
         typer.echo(f"{table.title}\n" if table.title else "")
         print_table(table.headings, table.rows, right=table.headings[1:] if table.title else ())
