@@ -85,7 +85,6 @@ class LpacAgents:
 
     @property
     def message_size(self) -> int:
-        """See `Agents`."""
         return self._policy.message_size
 
     def inputs(self, robot: int, observation: Observation) -> Inputs:
@@ -114,7 +113,6 @@ class LpacAgents:
         payloads: Sequence[Sequence[F32]],
         degrees: Sequence[int],
     ) -> PolicySteps:
-        """See `Agents`."""
         hops = HopBuffer(self._policy.geometry, len(robots))
         for i, (heard, degree) in enumerate(zip(payloads, degrees, strict=True)):
             hops.diffuse(heard, degree, i)
@@ -142,7 +140,6 @@ class SingleAgents:
 
     @property
     def message_size(self) -> int:
-        """See `Agents`."""
         return self._policies[0].message_size
 
     def inputs(self, robot: int, observation: Observation) -> Inputs:
@@ -156,7 +153,6 @@ class SingleAgents:
         return {**perceived.inputs, "features": perceived.features}
 
     def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
-        """See `Agents`."""
         return [each["features"] for each in inputs]
 
     def step(
@@ -166,7 +162,6 @@ class SingleAgents:
         payloads: Sequence[Sequence[F32]],
         degrees: Sequence[int],
     ) -> PolicySteps:
-        """See `Agents`."""
         steps = []
         for robot, seen, heard, degree in zip(robots, features, payloads, degrees, strict=True):
             try:
@@ -181,7 +176,6 @@ class SingleAgents:
         )
 
     def reset(self, robot: int) -> None:
-        """See `Agents`."""
         self._agents[robot] = self._policies[robot].agent()
 
 
