@@ -162,10 +162,7 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
     check_px4(run.vehicle, run.px4)
     count = _robot_count(drawn.robots, run.vehicle)
     scenario = _scenario(run, drawn, of_scenario, count)
-    from lpac.sim.engines import engine_of
-
-    with _told_as_option(f"--vehicle {run.vehicle.value}"):
-        engine_of(run.vehicle.value, run.px4).require_able(scenario)
+    _require_able(scenario, run)
     if run.out:
         run.out.mkdir(parents=True, exist_ok=True)
     if run.vehicle is VehicleKind.POINT:
@@ -195,6 +192,20 @@ def _told_as_option(beside: str) -> Iterator[None]:
     except UnableError as error:
         flag = _FLAGS.get(error.name, flag_of(error.name))
         raise ValueError(f"{flag} does nothing with {beside}") from None
+
+
+def _require_able(scenario: "Scenario", run: RunOptions) -> None:
+    """Raise ValueError that names an option which does nothing."""
+    from lpac.sim.engines import engine_of
+
+    if scenario.controller != "lpac":
+        # A baseline senses and decides at once, and nothing is sent.
+        with _told_as_option(f"--controller {scenario.controller}"):
+            scenario.require_default(
+                "baselines", "clocks", "payload", "loss", "delay_s", "max_message_age_s"
+            )
+    with _told_as_option(f"--vehicle {run.vehicle.value}"):
+        engine_of(run.vehicle.value, run.px4).require_able(scenario)
 
 
 def _scenario(
@@ -230,12 +241,6 @@ def _scenario(
         transport=drawn.transport if drawn.transport and not is_point else "mesh",
         **{name: getattr(of_scenario, name) for name in of_scenario.__dataclass_fields__},
     )
-    if scenario.controller != "lpac":
-        # A baseline senses and decides at once, and nothing is sent.
-        with _told_as_option(f"--controller {scenario.controller}"):
-            scenario.require_default(
-                "baselines", "clocks", "payload", "loss", "delay_s", "max_message_age_s"
-            )
     if drawn.starts is None:
         return scenario
     return replace(scenario, starts_m=_starts(drawn.starts, count, run.bundle, scenario))
