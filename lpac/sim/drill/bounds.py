@@ -124,6 +124,17 @@ class Part(NamedTuple):
         return heights_m
 
 
+def robots_of(group: RobotGroup, hit: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """Robots of a group, where a fault hits some of that many robots."""
+    everybody = tuple(range(count))
+    half = (count + 1) // 2
+    return {
+        "hit": hit, "next": tuple((robot + 1) % count for robot in hit),
+        "others": tuple(robot for robot in everybody if robot not in hit), "all": everybody,
+        "first half": everybody[:half], "second half": everybody[half:],
+    }[group]  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Bound(ABC):
     """A bound on a group of vehicles, in a time window from the fault, or from the mark `after`.
@@ -154,7 +165,7 @@ class Bound(ABC):
         cls, fault = type(self), flight.fault
         since_s = fault.marks[self.after] if self.after else fault.begin_s
         values = [cls.start]
-        for robot in _robots(flight, self.robots):
+        for robot in robots_of(self.robots, fault.hit, len(flight.vehicles)):
             track = flight.vehicles[robot].between(since_s + self.from_s, since_s + self.until_s)
             values.append(self.measure(Part(flight, robot, track, since_s)))
         limit, at_least = self.limit_in(flight), cls.worst is min
@@ -384,8 +395,9 @@ class LandApart(Always, name="landed apart", unit="m", worst=min):
     limit: float = _BESIDE_M - _ESTIMATES_ERR_M
 
     def measure(self, part: Part) -> float:
-        robots = _robots(part.flight, self.robots)
-        others = [part.flight.vehicles[robot] for robot in robots if robot > part.robot]
+        vehicles = part.flight.vehicles
+        robots = robots_of(self.robots, part.flight.fault.hit, len(vehicles))
+        others = [vehicles[robot] for robot in robots if robot > part.robot]
         if not part.track.is_in(*LANDING).any():
             return math.inf
         place_m = part.track.position_m[-1, :2]
@@ -539,17 +551,6 @@ class NotFaster(Bound, name="greatest speed", unit="m/s"):
 def judge(bounds: Sequence[Criterion], flight: FlightRecord) -> tuple[Figure, ...]:
     """All figures of a flight."""
     return tuple(bound.figure(flight) for bound in bounds)
-
-
-def _robots(flight: FlightRecord, group: RobotGroup) -> tuple[int, ...]:
-    everybody = tuple(range(len(flight.vehicles)))
-    following = tuple((robot + 1) % len(everybody) for robot in flight.fault.hit)
-    others = tuple(robot for robot in everybody if robot not in flight.fault.hit)
-    half = (len(everybody) + 1) // 2
-    return {
-        "hit": flight.fault.hit, "next": following, "others": others, "all": everybody,
-        "first half": everybody[:half], "second half": everybody[half:],
-    }[group]  # fmt: skip
 
 
 def _fence(flight: FlightRecord) -> Fence:

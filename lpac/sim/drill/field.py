@@ -18,16 +18,15 @@ from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import Ground
 from lpac.ground.station.protocol import (
     Request,
-    Resume,
     RobotCommand,
-    SafetyCommand,
     SetFence,
-    Start,
-    Takeoff,
+    command_name,
+    of_robots,
 )
 from lpac.sim.description import ERRORS
+from lpac.sim.drill.bounds import robots_of
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.injections import Do, FenceWithout, Injection, OperatorOrders, OrderedKind
+from lpac.sim.drill.injections import Do, FenceWithout, Injection, OperatorOrders
 from lpac.sim.fleet.layout import Layout
 from lpac.sim.px4.vector import level
 from lpac.sim.scenario import WORLD_SENSOR, Scenario
@@ -141,16 +140,13 @@ class FaultyFleet(ABC):
 
     def happen(self, do: Do, hit: tuple[int, ...]) -> None:
         """Do it to those who are meant."""
-        everybody = tuple(range(self.layout.scenario.robots))
-        robots = {
-            "hit": hit,
-            "all": everybody,
-            "others": tuple(robot for robot in everybody if robot not in hit),
-            "next": tuple((robot + 1) % len(everybody) for robot in hit),
-        }[do.to]
+        robots = robots_of(do.to, hit, self.layout.scenario.robots)
         match do.injection:
             case OperatorOrders(kind):
-                self._order(_request(kind, tuple(f"r{robot}" for robot in robots)))
+                names = tuple(f"r{robot}" for robot in robots)
+                # Every other kind needs nothing but its robots.
+                kill = RobotCommand("kill", names)
+                self._order(kill if kind == "kill" else of_robots(kind, names))
             case FenceWithout():
                 places_m = [self.layout.landing_points_m[robot] for robot in robots]
                 self._order(SetFence(_fence_without(self.layout.fence, places_m)))
@@ -161,7 +157,7 @@ class FaultyFleet(ABC):
         """Note that something is commanded now; call the result when it is answered."""
         index = len(self.orders)
         self.orders.append(
-            GivenOrder(_kind(request), self._addressed(request), self.now_s(), math.inf)
+            GivenOrder(command_name(request), self._addressed(request), self.now_s(), math.inf)
         )
 
         def answered() -> None:
@@ -217,7 +213,9 @@ class FaultyFleet(ABC):
         began_s = self.now_s()
         if self.send(request):
             robots = self._addressed(request)
-            self.orders.append(GivenOrder(_kind(request), robots, began_s, began_s + _ORDER_S))
+            self.orders.append(
+                GivenOrder(command_name(request), robots, began_s, began_s + _ORDER_S)
+            )
 
     def _addressed(self, request: Request) -> tuple[int, ...]:
         names: tuple[str, ...] = getattr(request, "robots", ())
@@ -252,27 +250,6 @@ def supports(kinds: Collection[object], fault: Fault) -> bool:
         type(do.injection) in kinds or getattr(do.injection, "kind", None) in kinds
         for do in fault.does
     )
-
-
-def _kind(request: Request) -> str:
-    """Name of an order in a flight's record."""
-    if isinstance(request, RobotCommand):
-        return request.kind
-    return request.action if isinstance(request, SafetyCommand) else type(request).__name__.lower()
-
-
-def _request(kind: OrderedKind, robots: tuple[str, ...]) -> Request:
-    match kind:
-        case "takeoff":
-            return Takeoff(robots)
-        case "start":
-            return Start(robots)
-        case "resume":
-            return Resume(robots)
-        case "hold" | "return" | "land":
-            return SafetyCommand(kind, robots)
-        case "pilot" | "rejoin" | "kill" | "disarm":
-            return RobotCommand(kind, robots)
 
 
 def _fence_without(fence: Fence, places_m: list[F64]) -> Fence:

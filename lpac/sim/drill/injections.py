@@ -14,6 +14,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.vehicle import Vector
+from lpac.sim.drill.bounds import RobotGroup
 from lpac.sim.fleet.pilot import PilotedVehicle
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vector import ZERO, minus, plus, times
@@ -366,16 +367,11 @@ class SecondLaptop:
     event: Literal["joins", "holds all", "takes command", "dies"]
 
 
-OrderedKind = Literal[
-    "takeoff", "start", "pilot", "rejoin", "kill", "disarm", "hold", "return", "land", "resume"
-]
-
-
 @dataclass(frozen=True, slots=True)
 class OperatorOrders:
     """The operator commands robots, and does not wait for the answer."""
 
-    kind: OrderedKind
+    kind: Literal["start", "rejoin", "kill", "hold", "return", "land", "resume"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,5 +395,5 @@ class Do:
 
     injection: Injection
     at_s: float = 0.0
-    to: Literal["hit", "all", "others", "next"] = "hit"
+    to: RobotGroup = "hit"
     mark: str = ""
