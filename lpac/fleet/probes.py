@@ -75,7 +75,7 @@ async def ping(session: Session, addresses: Mapping[str, str], count: int) -> di
         f"{{ {one} {shlex.quote(to)} 2>&1 | sed {shlex.quote(f's/^/{name} /')}; }} &"
         for name, to in addresses.items()
     ]
-    said = (await session.look({"pings": "\n".join([*script, "wait"])}))["pings"]
+    said = (await session.look({"": "\n".join([*script, "wait"])}, each_s=20.0))[""]
     lines = [line.partition(" ") for line in said.splitlines()]
     return {
         name: ping_summary("\n".join(text for of, _, text in lines if of == name))

@@ -68,8 +68,9 @@ async def pull(
     folder = out.resolve() / ("all" if trial is None else trial.replace("/", "_")) / robot.name
     async with visit(config, robot, report) as (session, found):
         await require_disarmed(session, robot, "pulling")
-        listed = [line.split(" ", 1) for line in (await session.look({"": _LIST}))[""].splitlines()]
-        times = {path: float(time_s) for time_s, path in listed}
+        listed = await session.run("sh", "-c", _LIST)
+        found_at = [line.split(" ", 1) for line in listed.out.splitlines()]
+        times = {path: float(time_s) for time_s, path in found_at}
         if trial is None:
             interval, logs = (_newest_s(folder), math.inf), [path for path in times if _log(path)]
             logs = [path for path in logs if times[path] >= interval[0]]
@@ -193,10 +194,11 @@ async def _keep_others(
     }
     if not here:
         return None
-    beginnings = await session.look({
+    commands = {
         name: f"head -c {path.stat().st_size} {shlex.quote(f'{remote}/{name}')} | sha256sum"
         for name, path in here.items()
-    })  # fmt: skip
+    }
+    beginnings = await session.look(commands, each_s=_STAGE_S / len(commands))
     others = [
         name
         for name, path in here.items()

@@ -166,10 +166,17 @@ class Session:
             raise RemoteError(f"{shlex.join(command)}: {done.reason}")
         return done.out
 
-    async def look(self, commands: Mapping[str, str]) -> dict[str, str]:
-        """What shell commands print, by name, without complaints; in one call."""
-        lines = [f"( {command}\n) 2>/dev/null; printf '\\036'" for command in commands.values()]
-        shown = await self.run("sh", "-c", "\n".join(["export LC_ALL=C", *lines]))
+    async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
+        """What shell commands print, by name, without complaints; in one call.
+
+        One that does not end in `each_s` has printed what it had by then.
+        """
+        lines = [
+            f"timeout {each_s:g} sh -c {shlex.quote(command)} 2>/dev/null; printf '\\036'"
+            for command in commands.values()
+        ]
+        script = "\n".join(["export LC_ALL=C", *lines])
+        shown = await self.run("sh", "-c", script, timeout_s=each_s * len(lines) + 5.0)
         return dict(zip(commands, map(str.strip, shown.out.split(_BETWEEN)), strict=False))
 
     async def write(self, path: str, content: bytes, mode: int = 0o644) -> None:

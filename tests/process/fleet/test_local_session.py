@@ -38,3 +38,9 @@ def test_starts_that_were_numbered_by_a_clock_far_ahead_are_numbered_anew(
         assert 0 <= int(start.read_text()) - now_ms < 60_000
     else:
         assert start.read_text() == before
+
+
+def test_a_tool_that_hangs_holds_nothing_up() -> None:
+    commands = {"before": "echo a; echo b >&2", "hung": "echo c; sleep 60", "after": 'echo "d\'"'}
+    found = asyncio.run(LocalSession().look(commands, each_s=0.5))
+    assert found == {"before": "a", "hung": "c", "after": "d'"}

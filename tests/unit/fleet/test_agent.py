@@ -156,7 +156,7 @@ class Robot(LocalSession):
     async def write(self, path: str, content: bytes, mode: int = 0o644) -> None:
         self.changed.append(path)
 
-    async def look(self, commands: Mapping[str, str]) -> dict[str, str]:
+    async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
         running = "Id=old.service\nLoadState=loaded\nActiveState=active\nUnitFileState=enabled\n"
         return dict.fromkeys(commands, running)
 
@@ -269,7 +269,7 @@ def test_a_container_engine_that_is_silent_keeps_nobody_from_being_enrolled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Silent(Robot):
-        async def look(self, commands: Mapping[str, str]) -> dict[str, str]:
+        async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
             return dict.fromkeys(commands, "")
 
     step = asyncio.run(setup.retire(Silent(), R1, ["old_stack"], lambda _: None))
