@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lpac.fleet.deploy import Deployed, deploy, rollback
-from lpac.fleet.hold import Report, lock, overview
+from lpac.fleet.hold import Report, overview
 from lpac.fleet.release import Common, Release, load_common, make_release
 from lpac.fleet.session import Session, connect
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
@@ -40,16 +40,12 @@ class Laptop:
         release = release or self.release(index)
         return asyncio.run(deploy(self.config, self.robot(index), release, report))
 
-    def ask(
-        self, index: int, question: Callable[[Session, RobotHost], Awaitable[T]], held: bool = False
-    ) -> T:
-        """What comes of it in a session, which has the lock if `held`."""
+    def ask(self, index: int, question: Callable[[Session, RobotHost], Awaitable[T]]) -> T:
+        """What comes of it in a session."""
 
         async def one() -> T:
             robot = self.robot(index)
             async with connect(self.config, robot) as session:
-                if held:
-                    await lock(session, self.config, robot)
                 return await question(session, robot)
 
         return asyncio.run(one())

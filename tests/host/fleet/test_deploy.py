@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import onnx
 import pytest
@@ -18,10 +19,17 @@ from onnx import numpy_helper
 
 from edge.policy.bundle import BUNDLE_ID, MANIFEST, make_bundle
 from lpac.fleet.deploy import deploy
-from lpac.fleet.hold import overview
+from lpac.fleet.hold import lock, overview
 from lpac.fleet.program import start, stop
 from lpac.fleet.release import Release, make_release
-from lpac.fleet.session import FleetError, RemoteError, UnreachableError, connect
+from lpac.fleet.session import (
+    FleetError,
+    RemoteError,
+    Session,
+    UnreachableError,
+    connect,
+)
+from lpac.fleet.settings import RobotHost
 from lpac.sim.hosts.rack import children
 from tests.host.fleet.field import (
     armed,
@@ -138,27 +146,31 @@ def test_interrupted_anywhere_the_robot_has_a_whole_release(laptop: Laptop) -> N
         with contextlib.suppress(FleetError):
             await deploying
 
+    async def found(session: Session, robot: RobotHost) -> list[dict[str, Any]]:
+        """As it is, and after the next operator has finished what was interrupted."""
+        first = await overview(session, laptop.config)
+        await session.call("check", folder="/opt/lpac/current/")
+        await lock(session, laptop.config, robot)
+        return [first, await overview(session, laptop.config)]
+
+    before = laptop.overview(0)["current"]
     for n in range(20):
-        before, release = laptop.overview(0)["current"], laptop.release(0, laptop.changed())
+        release = laptop.release(0, laptop.changed())
         mishap, after_s = mishaps[n % len(mishaps)], draw.uniform(0.0, lasts_s)
         asyncio.run(interrupted(release, mishap, after_s))
         host.heal()
         if mishap == host.power_off:
             host.power_on()
         await_free(host)
-        now = laptop.overview(0)
-        what = f"{n}: {mishap.__name__} after {after_s:.2f} of {lasts_s:.2f} s: {now}"
-        assert now["current"] in (before, release.id), what
-        laptop.ask(0, lambda session, _: session.call("check", folder="/opt/lpac/current/"))
-        # A switch that the power interrupted is finished by whoever comes next.
-        laptop.ask(0, lambda session, _: overview(session, laptop.config), held=True)
-        now = laptop.overview(0)
-        assert now["pending"] is None and now["service"]["fresh"], what
-        assert now["current"] in (before, release.id), what
+        first, now = laptop.ask(0, found)
+        what = f"{n}: {mishap.__name__} after {after_s:.2f} of {lasts_s:.2f} s: {first}, {now}"
+        assert {first["current"], now["current"]} <= {before, release.id}, what
+        assert now["pending"] is None and now["service"]["active"] == "active", what
+        before = now["current"]
     last = laptop.release(0, laptop.changed())
     assert laptop.deploy(0, last).summary == "runs"
     now = laptop.overview(0)
-    assert now["current"] == last.id and len(now["releases"]) == 2
+    assert now["current"] == last.id and len(now["releases"]) == 2 and boot_nonce(now)
     assert host.run("ls /opt/lpac/incoming") == ""
 
 
