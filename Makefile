@@ -64,7 +64,8 @@ export: .venv/export ## rebuild the shipped policy's bundle from its checkpoint
 ARCH ?= arm64
 image: | .venv/bin/pip ## the robot's image for ARM (or ARCH=amd64), and its size: out/image
 	@deploy/docker/image.sh $(ARCH)
-	@$(RUN) lpac.fleet.image out/image/$(ARCH)
+	@cd out/image && du -sh --apparent-size $(ARCH)/root lpac-edge-$(ARCH).tar.gz && \
+		du -h -d1 --apparent-size $(ARCH)/root/usr/lib/python3/dist-packages | sort -rh | head -n 9
 	@! command -v systemd-analyze > /dev/null || \
 		systemd-analyze security --offline=yes systemd/lpac-robot.service | tail -n 1
 

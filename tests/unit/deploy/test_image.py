@@ -2,13 +2,12 @@
 
 import re
 import tomllib
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from lpac.fleet.image import package_of
 from tests.conftest import ROOT
 
 DOCKER = ROOT / "deploy" / "docker"
@@ -35,11 +34,3 @@ def test_the_locks_are_what_the_project_asks_for(lock: str) -> None:
         version = versions.get(canonicalize_name(requirement.name))
         assert version is not None, f"{requirement.name}: run `make lock`"
         assert requirement.specifier.contains(version), f"{requirement}: run `make lock`"
-
-
-def test_packages_are_told_by_their_paths() -> None:
-    site = PurePosixPath("usr/lib/python3/dist-packages")
-    assert package_of(site / "numpy.libs" / "libgfortran.so.5") == "numpy"
-    assert package_of(site / "numpy-2.4.6.dist-info" / "METADATA") == "numpy"
-    assert package_of(PurePosixPath("usr/lib/python3.11/enum.py")) == "Python"
-    assert package_of(PurePosixPath("lib/aarch64-linux-gnu/libc.so.6")) == "libraries of Debian"
