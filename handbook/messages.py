@@ -13,8 +13,7 @@ from edge.core import wire
 from edge.core.fence import Fence
 from edge.core.schema import in_words
 from edge.drivers import flight_log
-from edge.identity import envelope, group
-from edge.identity.card import Card, Revocations
+from edge.identity import envelope, group, members
 from edge.messages import beacon, topics
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, Refusal, RefusalCode
 from edge.messages.mission import (
@@ -37,12 +36,12 @@ from lpac.ground import record
 
 MESSAGES = (
     RobotStatus, GroundState, Hold, Order, OrderResult, FailedCheck, Reason, Refusal, Origin, Fence,
-    Place, Echo, LoopStatus, RadioCounts, Card, Revocations, SafetyForm, OrderForm,
+    Place, Echo, LoopStatus, RadioCounts, SafetyForm, OrderForm,
 )  # fmt: skip
 CODES = (FlightState, CheckCode, ReasonCode, RefusalCode)
 _LAYOUTS = {
     "The beacon": beacon, "The policy's message": wire, "The envelope": envelope,
-    "What goes to all robots at once": group,
+    "What goes to all robots at once": group, "The list of members": members,
 }  # fmt: skip
 _LOGS = {"A robot's log": flight_log, "The ground's log": record}
 

@@ -147,7 +147,6 @@ class _ChangedLink:
         self.is_claimed = link.is_claimed
         self.peers = link.peers
         self.refused = link.refused
-        self.sends_again = link.sends_again
         self.close = link.close
 
     def publish(self, topic: Topic, data: bytes) -> None:

@@ -2,10 +2,9 @@
 
 | file | what |
 | --- | --- |
-| `identity.json` | fleet, authority (its public key) and card, both in hexadecimal digits |
+| `members` | the fleet's list of members: see `edge.identity.members` |
 | `key.pem` | the secret key, PKCS #8; for nobody else to read |
 | `certificate.pem`, `authority.pem` | for TLS: of the same key, and of the authority |
-| `revoked` | the newest list of revoked keys that was heard |
 | `start` | the number of this start of the program, greater than those before |
 | `room` | nothing: kept for the files above, should the disk be full |
 | `group-keys` | of a robot: the fleet's keys of its multicast group, in hexadecimal digits, a line
@@ -22,75 +21,94 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-
+from edge.core.logger import log
 from edge.core.schema import ConfigError
-from edge.identity.card import Card, CardError, verified
 from edge.identity.group import GroupKey
 from edge.identity.guard import Membership, SignedGuard
+from edge.identity.members import Member, Members, Role, parse_members
 from edge.identity.signature import SEED_BYTES, Signer
-from edge.messages.topics import TlsFiles
+from edge.messages.topics import GroupKeys, TlsFiles
 
 # The DER of an Ed25519 secret key (RFC 8410) is this, and then its seed.
 _PKCS8_HEAD = bytes.fromhex("302e020100300506032b657004220420")
-_MOST_BYTES = 2**16
-_REVOKED, _START, _ROOM = "revoked", "start", "room"
+_MOST_BYTES = 2**18
+_START, _ROOM = "start", "room"
 _ROOM_BYTES = 2**16
 _DAY_MS = 86_400_000
 AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM = "authority.pem", "certificate.pem", "key.pem"
-IDENTITY_JSON = "identity.json"
+MEMBERS = "members"
 GROUP_KEYS = "group-keys"
 
 
 @dataclass(slots=True)
 class Identity:
-    """One start of a member's program; `start_is_kept` says whether the disk has its number."""
+    """One start of a member's program; `start_is_kept` says whether the disk has its number.
+
+    `group_keys` are None for a member that was given none, which is not in the group.
+    """
 
     folder: Path
     membership: Membership
-    card: Card
     tls: TlsFiles
-    revocations: bytes
-    group_keys: tuple[bytes, ...]
+    group_keys: GroupKeys | None
     start_is_kept: bool = True
+    _given_keys: tuple[bytes, ...] = ()
+    _stamps: tuple[object, ...] = ()
 
     def guard(self, clock_s: Callable[[], float]) -> SignedGuard:
         """The guard that the program speaks and hears through; `clock_s` is its monotonic clock."""
-        return SignedGuard(self.membership, clock_s, self.revocations)
+        return SignedGuard(self.membership, clock_s)
 
-    def keep(self, guard: SignedGuard) -> None:
-        """Write what the next start has to know, unless it is on the disk: this start, and the
-        revocations that the guard heard. Tell the guard of newer ones on the disk.
+    def take_up(self, guard: SignedGuard, *, in_flight: bool = False) -> None:
+        """Follow the list of members and the group's keys on the disk; then write the start.
 
-        Raises OSError that names the file.
+        Files that cannot be used change nothing, and are reported once. In flight the spoken key of
+        the group stays, and all keys that are heard: others may not have been given the newest.
+
+        Raises OSError that names the file, if the start cannot be written.
         """
+        stamps = tuple(_stamp(self.folder / name) for name in (MEMBERS, GROUP_KEYS))
+        if stamps != self._stamps:
+            self._stamps = stamps
+            try:
+                guard.take(read_members(self.folder))
+                self._given_keys = read_group_keys(self.folder / GROUP_KEYS)
+            except (ValueError, OSError) as error:
+                log.warning("list of members not taken up", why=str(error))
+        if self.group_keys is not None and self._given_keys:
+            self.group_keys = _followed(self.group_keys, self._given_keys, in_flight=in_flight)
         if not self.start_is_kept:
             _keep_start(self)
-        kept = _revocations_in(self.folder)
-        if kept == guard.revocations:
-            return
-        guard.hear_revocations(kept)
-        if guard.revocations != kept:
-            _write(self.folder / _REVOKED, guard.revocations)
 
 
-def load_identity(folder: Path, *, fleet: str, unix_s: float) -> Identity:
+def _followed(now: GroupKeys, given: tuple[bytes, ...], *, in_flight: bool) -> GroupKeys:
+    if not in_flight:
+        return now if now.heard == given else GroupKeys(given, given[0])
+    older = tuple(key for key in now.heard if key not in given)
+    return now if now.heard == given + older else GroupKeys(given + older, now.spoken)
+
+
+def load_identity(
+    folder: Path, *, fleet: str, unix_s: float, robot_id: int | None = None
+) -> Identity:
     """The identity in the folder, for a new start of the program.
 
     Starts are numbered by the wall clock, ms, or by one more than the last where that is behind:
     a computer whose clock was lost is heard all the same. A number that cannot be written is no
-    obstacle: `Identity.keep` says so, and tries again.
+    obstacle: `Identity.take_up` says so, and tries again. With `robot_id` it must be that robot's;
+    one that is not in the list of members starts all the same, as it may be in the air.
 
     Raises ConfigError, in one line, for what cannot be used; OSError.
     """
     last, unix_ms = _last_start(folder / _START), int(unix_s * 1e3)
-    identity = _load(folder, fleet, max(last + 1, unix_ms))
+    identity = _load(folder, fleet, max(last + 1, unix_ms), robot_id)
     try:
         _keep_start(identity)
     except OSError:
         if unix_ms <= last:
             # The next start would have the same number; this grows until the computer restarts.
-            identity = _load(folder, fleet, last + 1 + time.monotonic_ns() // 10**6 % _DAY_MS)
+            start = last + 1 + time.monotonic_ns() // 10**6 % _DAY_MS
+            identity = _load(folder, fleet, start, robot_id)
         identity.start_is_kept = False
     return identity
 
@@ -103,89 +121,56 @@ def _keep_start(identity: Identity) -> None:
     identity.start_is_kept = True
 
 
-def listening_identity(folder: Path, *, fleet: str) -> Identity:
+def listening_identity(folder: Path, *, fleet: str, robot_id: int | None = None) -> Identity:
     """The same for a program that says nothing: it is no new start, and nothing is written.
 
     Raises as above.
     """
-    return _load(folder, fleet, 0)
+    return _load(folder, fleet, 0, robot_id)
 
 
-def _load(folder: Path, fleet: str, start: int) -> Identity:
+def _load(folder: Path, fleet: str, start: int, robot_id: int | None) -> Identity:
     try:
-        written = _Written.read(folder / IDENTITY_JSON)
+        members = read_members(folder)
         signer = Signer(_seed(folder / KEY_PEM))
-        membership = Membership(written.authority_key, signer, written.card_data, start)
-        card = membership.card
-        revocations = _revocations_in(folder)
-        # Before anything counts on it.
-        SignedGuard(membership, lambda: 0.0, revocations)
-        group_keys = _group_keys(folder / GROUP_KEYS)
+        keys = read_group_keys(folder / GROUP_KEYS)
     except FileNotFoundError as error:
         raise ConfigError(
             f"{folder}: {Path(error.filename).name} is missing: enroll it first (`lpac fleet "
             "enroll` for a robot, `lpac fleet operator` for a ground station)"
         ) from None
-    except (CardError, ValueError) as error:
+    except ValueError as error:
         raise ConfigError(f"{folder}: {error}") from None
-    if card.fleet != fleet or written.fleet != fleet:
-        raise ConfigError(f"{folder}: is of fleet {card.fleet!r}, not of {fleet!r}")
+    if members.fleet != fleet:
+        raise ConfigError(f"{folder}: is of fleet {members.fleet!r}, not of {fleet!r}")
+    own = members.by_key.get(signer.fingerprint)
+    if own is None and robot_id is None:
+        raise ConfigError(
+            f"{folder}: its key is not in the list of members: make a new one with `lpac fleet "
+            "operator`"
+        )
+    if own is None:
+        own = Member(Role.ROBOT, f"robot-{robot_id}", robot_id, signer.public_key)
+    if robot_id not in (None, own.robot_id):
+        raise ConfigError(f"{folder}: is {own.role} {own.name}'s, not robot {robot_id}'s")
     paths = (str(folder / name) for name in (AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM))
-    return Identity(folder, membership, card, TlsFiles(*paths), revocations, group_keys)
+    group_keys = GroupKeys(keys, keys[0]) if keys else None
+    membership = Membership(own, signer, members, start)
+    return Identity(folder, membership, TlsFiles(*paths), group_keys, _given_keys=keys)
 
 
-def load_card(folder: Path, authority: bytes) -> Card:
-    """The card alone, as the authority of that public key signed it.
+def read_members(folder: Path) -> Members:
+    """The list of members in the folder. Raises MembersError, OSError."""
+    return parse_members(_bytes_of(folder / MEMBERS).decode("utf-8", "replace"))
 
-    Raises ConfigError for what is none; OSError.
-    """
+
+def _stamp(path: Path) -> tuple[int, ...] | None:
+    """Whatever changes with a file's content, as it is never written in place."""
     try:
-        return verified(Card, _Written.read(folder / IDENTITY_JSON).card_data, authority)
-    except (CardError, ValueError) as error:
-        raise ConfigError(f"{folder}: {error}") from None
-
-
-def card_in(text: str, keys: Path) -> Card:
-    """The card in the text of an `identity.json`, of the same fleet as the one in `keys`.
-
-    Raises ConfigError for what is none; OSError.
-    """
-    own = _Written.read(keys / IDENTITY_JSON)
-    try:
-        return verified(Card, _Written.parse(text.encode()).card_data, own.authority_key)
-    except (CardError, ValueError) as error:
-        raise ConfigError(f"its card: {error}") from None
-
-
-@dataclass(frozen=True, slots=True)
-class _Written:
-    fleet: str
-    authority: str
-    card: str
-
-    @classmethod
-    def read(cls, path: Path) -> "_Written":
-        try:
-            return cls.parse(_bytes_of(path))
-        except msgspec.MsgspecError as error:
-            raise ValueError(f"{path.name}: {error}") from None
-
-    @classmethod
-    def parse(cls, data: bytes) -> "_Written":
-        return msgspec.json.decode(data, type=cls)
-
-    @property
-    def authority_key(self) -> bytes:
-        return bytes.fromhex(self.authority)
-
-    @property
-    def card_data(self) -> bytes:
-        return bytes.fromhex(self.card)
-
-
-def identity_json(fleet: str, authority: bytes, card_data: bytes) -> bytes:
-    """The file of that name."""
-    return msgspec.json.encode(_Written(fleet, authority.hex(), card_data.hex()))
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def group_keys_text(keys: Sequence[bytes]) -> bytes:
@@ -193,8 +178,8 @@ def group_keys_text(keys: Sequence[bytes]) -> bytes:
     return "".join(f"{key.hex()}\n" for key in keys).encode()
 
 
-def _group_keys(path: Path) -> tuple[bytes, ...]:
-    """None of them, if there is no file. Raises ValueError."""
+def read_group_keys(path: Path) -> tuple[bytes, ...]:
+    """The keys in the file, none if there is no file. Raises ValueError, OSError."""
     try:
         _require_private(path)
         keys = tuple(map(bytes.fromhex, _bytes_of(path).decode("ascii", "replace").split()))
@@ -220,13 +205,6 @@ def _seed(path: Path) -> bytes:
     if len(der) != len(_PKCS8_HEAD) + SEED_BYTES or not der.startswith(_PKCS8_HEAD):
         raise ValueError(f"{path.name}: is no Ed25519 key (PKCS #8, PEM)")
     return der[len(_PKCS8_HEAD) :]
-
-
-def _revocations_in(folder: Path) -> bytes:
-    try:
-        return _bytes_of(folder / _REVOKED)
-    except FileNotFoundError:
-        return b""
 
 
 def _last_start(path: Path) -> int:

@@ -29,7 +29,7 @@ from edge.identity.group import (
     open_datagram,
 )
 from edge.messages.admission import Admission
-from edge.messages.topics import CARD, Group, ReceiveCallback, Topic
+from edge.messages.topics import Group, GroupKeys, ReceiveCallback, Topic
 
 # Of a hundred robots' messages those of a second, where the kernel allows as much (rmem_max).
 _BUFFER_BYTES = 2**19
@@ -75,11 +75,11 @@ class MulticastLink:
         self._robot_id = robot_id
         self._zenoh = zenoh
         self._callbacks = {t: c for t, c in subscriptions.items() if t in TOPICS_OF_GROUP}
-        self._keys = tuple(map(GroupKey.of, group.keys))
+        self._known: GroupKeys | None = None
+        self._keys: tuple[GroupKey, ...] = ()
         self._own_start = -1  # Of this program, once it has spoken.
         self._said_as_this_one_s = -math.inf
-        self._assembly = Assembly(math.inf if group.is_secret else _FORGETS_AFTER_S)
-        # No robot with a card has a greater one.
+        # No robot with a certificate has a greater one.
         self._greatest_id = MAX_CERTIFIED_ID if group.is_secret else MAX_ROBOT_ID
         self._admission = Admission(_MOST_PLACES)
         self._lock = Lock()
@@ -104,16 +104,15 @@ class MulticastLink:
         head = read_head(data)
         if head is not None:
             self._own_start = head.number.start
+        spoken = GroupKey.of(self._group.keys().spoken)
         try:
             self._sender.setsockopt(
                 socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._group.interface)
             )
-            for datagram in datagrams(data, topic=topic, sender=self._robot_id, key=self._keys[0]):
+            for datagram in datagrams(data, topic=topic, sender=self._robot_id, key=spoken):
                 self._sender.sendto(datagram, (self._group.address, self._group.port))
         except (OSError, ValueError) as error:  # No network, a full queue, or too large a message.
             self._failed(f"publish {topic.name}", error)
-        if topic == CARD:
-            self._zenoh.publish(topic, data)  # The ground is not in the group.
 
     def is_claimed(self, robot_id: int) -> bool:
         """Whether another session says that it is that robot."""
@@ -159,6 +158,7 @@ class MulticastLink:
             with suppress(TimeoutError):
                 data = receiver.recv(2048)
                 came += 1
+                self._follow_keys()
                 fragment = open_datagram(data, self._keys)
                 if fragment is None or fragment.sender > self._greatest_id:
                     self._strangers += 1
@@ -172,6 +172,13 @@ class MulticastLink:
             if counted_s >= _COUNTS_FOR_S:
                 many_come = _MANY_HZ * counted_s < came < _FLOOD_HZ * counted_s
                 came, counts_since_s = 0, time.monotonic()
+
+    def _follow_keys(self) -> None:
+        """Hear by the keys as they are now; what was told of a sender's key is over with them."""
+        keys = self._group.keys()
+        if keys != self._known:
+            self._known, self._keys = keys, tuple(map(GroupKey.of, keys.heard))
+            self._assembly = Assembly(math.inf if self._group.is_secret else _FORGETS_AFTER_S)
 
     def _take(self, fragment: Fragment, now_s: float) -> None:
         message = self._assembly.add(fragment, now_s, time.time())

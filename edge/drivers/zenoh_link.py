@@ -37,7 +37,6 @@ from edge.core.wire import MAX_ROBOT_ID
 from edge.drivers.door import Door, DoorStatus, listening
 from edge.messages.admission import Admission
 from edge.messages.topics import (
-    GROUND_CARD,
     HOLD,
     TOPICS,
     Knocking,
@@ -81,8 +80,6 @@ class ZenohLink:
     Every method may be called from any thread. Close it, or use it as a context manager: the
     interpreter does not exit while it is open.
     """
-
-    sends_again = True
 
     def __init__(
         self,
@@ -398,7 +395,7 @@ def _access_control(prefix: str) -> dict[str, object]:
     """Access rules below the prefix: publishers by their certificates' names; all hear all."""
     may_say = {
         "operator": [f"{prefix}ground/**"],
-        "observer": [f"{prefix}ground/{topic.name}" for topic in (HOLD, GROUND_CARD)],
+        "observer": [f"{prefix}ground/{HOLD.name}"],
         **{f"robot-{id_}": [f"{prefix}robot/{id_}/**"] for id_ in range(MAX_CERTIFIED_ID + 1)},
     }
     listening = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]

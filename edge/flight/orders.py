@@ -83,9 +83,9 @@ def _not_ready(t: Tick) -> Refusal | None:
     return Refusal(RefusalCode.NOT_READY, f"not ready: {texts(failed)}") if failed else None
 
 
-def _card_not_good(t: Tick) -> Refusal | None:
+def _not_a_member(t: Tick) -> Refusal | None:
     """The one preflight check without which a flight goes on, but no mission begins."""
-    failed = [c for c in t.inputs.failed_checks or () if c.code is CheckCode.CARD_NOT_GOOD]
+    failed = [c for c in t.inputs.failed_checks or () if c.code is CheckCode.NOT_A_MEMBER]
     return Refusal(RefusalCode.NOT_READY, texts(failed)) if failed else None
 
 
@@ -135,7 +135,7 @@ ORDERS: Mapping[OrderKind, OrderRule] = {
     ),
     "start": OrderRule(
         taken_in=(_S.HOLD,),
-        checks=(_ground_commands, _card_not_good, _not_in_place, _cannot_start),
+        checks=(_ground_commands, _not_a_member, _not_in_place, _cannot_start),
         trial="begins",
     ),
     # Also in PILOT, where it has no effect.

@@ -45,14 +45,14 @@ from nacl.exceptions import CryptoError
 
 from edge.identity.envelope import HEAD_BYTES, read_head
 from edge.identity.news import MessageNumber, Newest
-from edge.messages.topics import CARD, MESSAGE, Topic
+from edge.messages.topics import MESSAGE, Topic
 
 KEY_BYTES: int = crypto_secretbox_KEYBYTES
 MOST_FRAGMENTS = 3
 # What fits into one frame of 1500 bytes, behind the headers of IPv4 and UDP.
 DATAGRAM_BYTES = 1472
 # What robots tell each other; everything else is for the ground, or by it.
-TOPICS_OF_GROUP = (MESSAGE, CARD)
+TOPICS_OF_GROUP = (MESSAGE,)
 
 _MAGIC, _VERSION = b"LG", 2
 _FINGERPRINT_BYTES, _TAG_BYTES = 4, 16
@@ -62,8 +62,8 @@ PART_BYTES = DATAGRAM_BYTES - _HEAD.size - _TAG_BYTES - _FRAGMENT.size
 MOST_BYTES = HEAD_BYTES + MOST_FRAGMENTS * PART_BYTES
 # A sender's fragments come one after another; a fourth message in pieces means that one is lost.
 _MOST_PARTIAL = 3
-# Both topics of each robot of the largest fleet with certificates, and some.
-_MOST_SENDERS = 600
+# Each robot of the largest fleet with certificates, and some.
+_MOST_SENDERS = 300
 
 
 class GroupKey(NamedTuple):

@@ -13,7 +13,6 @@ from threading import Lock
 from typing import NamedTuple, Protocol
 
 from edge.core.logger import log
-from edge.identity.card import Card, CardError, Revocations, Role, verified
 from edge.identity.envelope import (
     NO_MEMBERS,
     RELEASE,
@@ -24,35 +23,20 @@ from edge.identity.envelope import (
     read_envelope,
     seal,
 )
+from edge.identity.members import Member, Members, Role, number_of
 from edge.identity.news import NOTHING, MessageNumber, Newest
 from edge.identity.signature import Signer
-from edge.messages.topics import (
-    CARD,
-    GROUND_CARD,
-    HOLD,
-    REVOKED,
-    Link,
-    ReceiveCallback,
-    Topic,
-)
+from edge.messages.topics import HOLD, Link, ReceiveCallback, Topic
 
-_MOST_CARDS = 1000
-# How often a card is shown at most when somebody new is heard; then, so that he hears it whatever
-# is lost; and when all know all, which is most of a flight, and nearly for nothing.
-_SHOWN_AT_MOST_EVERY_S = 0.25
-_SHOWN_TO_NEW_EVERY_S, _NEW_FOR_S = 2.0, 20.0
-# At first more often where nothing lost is sent again: until a lost card comes once more, whoever
-# begins is deaf to who sent it.
-_SHOWN_IN_HASTE_EVERY_S, _HASTE_S = 0.5, 1.5
-_SHOWN_EVERY_S = {CARD: 1.0 / CARD.rate_hz, GROUND_CARD: 1.0 / GROUND_CARD.rate_hz}
 # What was on its way when a member's program started again has come by then.
 _LONGEST_TRANSIT_S = 5.0
+_MOST_NAMED = 4
 # No clock is further ahead than a wrong time zone makes it; one that was lost is behind.
 _MOST_AHEAD_MS = 24 * 3600e3
 
 
 class Speaker(NamedTuple):
-    """Sender of a message, and its program: `name` is its card's, "" where nothing is signed.
+    """Sender of a message, and its program: `name` is the list's, "" where nothing is signed.
 
     `number` is the message's; `release` and `members` are what the sender flies and knows.
     """
@@ -78,7 +62,6 @@ class RefusedMessage(StrEnum):
 
     NO_ENVELOPE = "no_envelope"
     UNKNOWN_KEY = "unknown_key"
-    REVOKED = "revoked"
     NOT_ALLOWED = "not_allowed"
     FORGED = "forged"
     REPLAYED = "replayed"
@@ -91,6 +74,8 @@ class _Heard:
 
     newest: Newest = field(default_factory=Newest)
     newest_s: float = -math.inf
+    # Digest of the list of members that it had then.
+    members: bytes = NO_MEMBERS
     # Its newest word every second or so, back to the longest transit ago.
     before: deque[tuple[float, MessageNumber]] = field(default_factory=deque)
     # Of its words behind the newest one: since when they come, until when, and the greatest.
@@ -100,10 +85,11 @@ class _Heard:
     # When such a word came last that was no longer on its way: a second program said it.
     twice_s: float = -math.inf
 
-    def hear(self, number: MessageNumber, now_s: float) -> None:
+    def hear(self, head: Head, now_s: float) -> None:
         """It is news."""
+        number = head.number
         self.newest.hear(number, now_s)
-        self.newest_s = now_s
+        self.newest_s, self.members = now_s, head.members
         if not self.before or now_s - self.before[-1][0] >= 1.0:
             self.before.append((now_s, number))
         while len(self.before) > 1 and now_s - self.before[1][0] > _LONGEST_TRANSIT_S:
@@ -123,14 +109,6 @@ class _Heard:
             self.twice_s = now_s
 
 
-class CardProblem(StrEnum):
-    """Why others do not listen to this member, or it must not take off."""
-
-    REVOKED = "revoked"
-    REPLACED = "replaced"
-    EXPIRED = "expired"
-
-
 class Guard(Protocol):
     """Interface through which a node speaks and hears."""
 
@@ -147,11 +125,11 @@ class Guard(Protocol):
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """The payload in this sender's envelope."""
 
-    def introduce(self) -> None:
-        """Show others who this is, if it is time; for a node that may have nothing to say."""
+    def is_listed(self) -> bool:
+        """Whether the list of members has this program's key: else nobody listens to it."""
 
-    def card_problem(self, unix_s: float) -> CardProblem | None:
-        """Describe the fault of this member's own card at that time; None: there is none."""
+    def members_differ(self) -> str:
+        """Describe who of those heard lately has another list of members; "" if nobody has."""
 
     def revoked_robots(self) -> frozenset[int]:
         """Robots that are listened to no more, and may still fly."""
@@ -210,11 +188,13 @@ class Unguarded:
         hear(key, envelope.payload, Speaker.of(role, "", envelope.head))
         return True
 
-    def introduce(self) -> None:
+    def is_listed(self) -> bool:
         """See `Guard`."""
+        return True
 
-    def card_problem(self, unix_s: float) -> CardProblem | None:
+    def members_differ(self) -> str:
         """See `Guard`."""
+        return ""
 
     def revoked_robots(self) -> frozenset[int]:
         """See `Guard`."""
@@ -240,50 +220,31 @@ class Unguarded:
 class Membership:
     """One program's place in its fleet.
 
-    `authority` is the public key of the fleet's authority, `card_data` the card as it signed it,
-    `start` what tells this start of the program from all before, which were smaller.
+    `own` is the member that it is, if the list says so, `members` the list as it begins, `start`
+    what tells this start of the program from all before, which were smaller.
     """
 
-    authority: bytes
+    own: Member
     signer: Signer
-    card_data: bytes
+    members: Members
     start: int
-
-    @property
-    def card(self) -> Card:
-        """Identify a sender. Raises CardError if its card is of another key or authority."""
-        card = verified(Card, self.card_data, self.authority)
-        if card.public_key != self.signer.public_key:
-            raise CardError(f"the card of {card.name} is for another key than the one beside it")
-        return card
 
 
 class SignedGuard:
     """The guard of a member. From any thread.
 
-    Nobody needs a list of members: each shows its card, which the authority has signed, now and
-    then and when somebody new is heard; more often in the beginning over a link that
-    sends nothing again. It comes in its owner's envelope, by which others know a program that just
-    began, and may need their cards, also if it says nothing else, as a ground that does not
-    command. `revocations` is the newest signed list that is known.
+    `members` is the list that counts now: whoever is not in it is not heard.
     """
 
-    def __init__(
-        self,
-        membership: Membership,
-        clock_s: Callable[[], float],
-        revocations: bytes = b"",
-    ) -> None:
-        """Raises CardError for a card or a list that is not this fleet's."""
-        self.card = membership.card
-        self._membership = membership
+    def __init__(self, membership: Membership, clock_s: Callable[[], float]) -> None:
+        self.members = membership.members
+        self._own = membership.own
+        self._signer = membership.signer
+        self._start = membership.start
         self._clock_s = clock_s
         self._lock = Lock()
-        self._members: dict[tuple[Role, str], Card] = {self.card.member: self.card}
-        self._cards: dict[bytes, Card] = {self.card.fingerprint: self.card}
-        self._revocations = Revocations(0)
-        self._revoked: frozenset[bytes] = frozenset()
-        self.revocations = b""
+        # Robots of an earlier list that are in the list no more.
+        self._left: frozenset[int] = frozenset()
         self._heard: defaultdict[tuple[bytes, str], _Heard] = defaultdict(_Heard)
         # When a key's start lay ahead of the clock; when the own key was said by a later start.
         self._ahead_s: dict[bytes, float] = {}
@@ -292,59 +253,55 @@ class SignedGuard:
         self._unix_offset_s: float | None = None
         self._refused: Counter[RefusedMessage] = Counter()
         self._sequences: Counter[str] = Counter()
-        self._shown_at_s = self._new_until_s = -math.inf
-        # A program that begins is new to all.
-        self._show_soon = True
-        self._link: Link | None = None
-        if revocations and not self.hear_revocations(revocations):
-            raise CardError("Revocations: this fleet's authority has not signed it")
+
+    def take(self, members: Members) -> None:
+        """Take a newer list, from now on. Raises MembersError if it is none."""
+        with self._lock:
+            self.members.require_newer(members)
+            if members != self.members:
+                former = self._left | self.members.robot_ids
+                self._left, self.members = former - members.robot_ids, members
 
     @property
     def role(self) -> Role:
         """See `Guard`."""
-        return self.card.role
-
-    @property
-    def _authority(self) -> bytes:
-        return self._membership.authority
-
-    @property
-    def _start(self) -> int:
-        return self._membership.start
+        return self._own.role
 
     def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
         """See `Guard`."""
-        return {
-            **{topic: partial(self._receive, topic, callback) for topic, callback in hear.items()},
-            CARD: partial(self._receive_card, CARD),
-            GROUND_CARD: partial(self._receive_card, GROUND_CARD),
-            REVOKED: self._receive_revocations,
-        }
+        return {topic: partial(self._receive, topic, callback) for topic, callback in hear.items()}
 
     def over(self, link: Link) -> Link:
         """See `Guard`."""
-        self._link = link
         return _SealingLink(self, link)
 
-    def introduce(self) -> None:
+    def is_listed(self) -> bool:
         """See `Guard`."""
-        if self._link is not None:
-            for topic, shown in self._to_show(again=self._link.sends_again):
-                self._link.publish(topic, shown)
+        listed = self.members.by_key.get(self._own.fingerprint)
+        return listed is not None and listed.place == self._own.place
 
-    def card_problem(self, unix_s: float) -> CardProblem | None:
+    def members_differ(self) -> str:
         """See `Guard`."""
-        if self.card.fingerprint in self._revoked:
-            return CardProblem.REVOKED
-        if self._members[self.card.member] is not self.card:
-            return CardProblem.REPLACED
-        return CardProblem.EXPIRED if unix_s > self.card.expires_unix_s else None
+        since_s, members = self._clock_s() - _LONGEST_TRANSIT_S, self.members
+        newest: dict[bytes, _Heard] = {}
+        with self._lock:
+            for (key, _), heard in self._heard.items():
+                if heard.newest_s >= max(since_s, newest.get(key, heard).newest_s):
+                    newest[key] = heard
+        others = [
+            f"{sender.name} has {_compared(number_of(newest[key].members), members.number)}"
+            for key, sender in members.by_key.items()
+            if key in newest and newest[key].members != members.digest
+        ]
+        if not others:
+            return ""
+        more = [f"and {len(others) - _MOST_NAMED} more"] if len(others) > _MOST_NAMED else []
+        said = ", ".join(others[:_MOST_NAMED] + more)
+        return f"the list of members here is {members.number}, and {said}: run `lpac fleet up`"
 
     def revoked_robots(self) -> frozenset[int]:
         """See `Guard`."""
-        with self._lock:
-            revoked = [c for c in self._members.values() if c.fingerprint in self._revoked]
-        return frozenset(card.robot_id for card in revoked if card.robot_id is not None)
+        return self._left
 
     def robots_said_twice(self) -> frozenset[int]:
         """See `Guard`."""
@@ -353,7 +310,7 @@ class SignedGuard:
             heard = {key for (key, _), said in self._heard.items() if said.newest_s >= since_s}
             twice = {key for (key, _), said in self._heard.items() if said.twice_s >= since_s}
             ahead = {key for key, at_s in self._ahead_s.items() if at_s >= since_s}
-        own = {self.card.fingerprint} if self._own_said_s >= since_s else set()
+        own = {self._own.fingerprint} if self._own_said_s >= since_s else set()
         return self._robots(twice | (ahead & heard) | own)
 
     def robots_ahead(self) -> frozenset[int]:
@@ -363,8 +320,8 @@ class SignedGuard:
             return self._robots({key for key, at_s in self._ahead_s.items() if at_s >= since_s})
 
     def _robots(self, fingerprints: Iterable[bytes]) -> frozenset[int]:
-        cards = (self._cards.get(fingerprint) for fingerprint in fingerprints)
-        return frozenset(card.robot_id for card in cards if card and card.robot_id is not None)
+        found = (self.members.by_key.get(fingerprint) for fingerprint in fingerprints)
+        return frozenset(m.robot_id for m in found if m and m.robot_id is not None)
 
     def hear_time(self, unix_s: float) -> None:
         """See `Guard`."""
@@ -381,29 +338,23 @@ class SignedGuard:
     # At the port, before there is a connection: see `edge.drivers.door`
 
     def knock(self, place: str) -> bytes:
-        """See `edge.messages.topics.Knocking`: the own card, in an envelope for this alone."""
-        return self._seal(_knock_key(self.card, place), self._membership.card_data)
+        """See `edge.messages.topics.Knocking`."""
+        return self._seal(_knock_key(self._own, place), b"")
 
     def is_knock(self, data: bytes, place: str) -> bool:
         """See `edge.messages.topics.Knocking`. A robot's own knock, said again, is none."""
         envelope = read_envelope(data)
-        if envelope is None or envelope.head.fingerprint in self._revoked:
+        sender = None if envelope is None else self.members.by_key.get(envelope.head.fingerprint)
+        if envelope is None or sender is None:
             return False
-        try:
-            card = verified(Card, envelope.payload, self._authority)
-        except CardError:
-            return False
-        key = _knock_key(card, place)
-        is_theirs = card.fingerprint == envelope.head.fingerprint and envelope.is_from(
-            card.public_key, Address(self._authority, key)
-        )
-        return is_theirs and self._overtaken(key, card, envelope) is None
+        key = _knock_key(sender, place)
+        return self._problem(key, sender, envelope) is None
 
     # What goes out
 
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """See `Guard`."""
-        return self._seal(self._own_key(topic), payload)
+        return self._seal(_key(self._own, topic), payload)
 
     def _seal(self, key: str, payload: bytes) -> bytes:
         with self._lock:
@@ -411,41 +362,11 @@ class SignedGuard:
             sequence = self._sequences[key]
         return seal(
             payload,
-            signer=self._membership.signer,
-            address=Address(self._authority, key),
+            signer=self._signer,
+            address=Address(self.members.authority, key),
             number=MessageNumber(self._start, sequence),
+            members=self.members.digest,
         )
-
-    def _own_key(self, topic: Topic) -> str:
-        if self.card.role is Role.ROBOT:
-            return f"robot/{self.card.robot_id}/{topic.name}"
-        return f"ground/{topic.name}"
-
-    def _to_show(self, *, again: bool) -> tuple[tuple[Topic, bytes], ...]:
-        """The own card, and from an operator the revocations, if it is time.
-
-        `again`: what is lost is sent again.
-        """
-        now_s = self._clock_s()
-        card = CARD if self.card.role is Role.ROBOT else GROUND_CARD
-        with self._lock:
-            if self._show_soon:
-                wait_s = _SHOWN_AT_MOST_EVERY_S
-            elif not again and now_s < self._new_until_s - _NEW_FOR_S + _HASTE_S:
-                wait_s = _SHOWN_IN_HASTE_EVERY_S
-            elif now_s < self._new_until_s:
-                wait_s = _SHOWN_TO_NEW_EVERY_S
-            else:
-                wait_s = _SHOWN_EVERY_S[card]
-            if now_s - self._shown_at_s < wait_s:
-                return ()
-            if self._show_soon:
-                self._new_until_s = now_s + _NEW_FOR_S
-            self._shown_at_s, self._show_soon = now_s, False
-        shown = [(card, self.seal(card, self._membership.card_data))]
-        if self.card.role is Role.OPERATOR and self.revocations:
-            shown.append((REVOKED, self.revocations))
-        return tuple(shown)
 
     # What comes in
 
@@ -463,29 +384,31 @@ class SignedGuard:
         envelope = read_envelope(data)
         if envelope is None:
             return RefusedMessage.NO_ENVELOPE
-        card = self._cards.get(envelope.head.fingerprint)
-        if envelope.head.fingerprint in self._revoked:
-            return RefusedMessage.REVOKED
-        if card is None:
-            self._show_soon = True  # It may know as little of this one.
+        sender = self.members.by_key.get(envelope.head.fingerprint)
+        if sender is None:
             return RefusedMessage.UNKNOWN_KEY
-        if not _may_say(card, topic, key):
+        if not _may_say(sender, topic, key):
             return RefusedMessage.NOT_ALLOWED
-        if not envelope.is_from(card.public_key, Address(self._authority, key)):
-            return RefusedMessage.FORGED
-        refused = self._overtaken(key, card, envelope)
-        if refused is not None:
-            return refused
-        return envelope.payload, Speaker.of(card.role, card.name, envelope.head)
+        problem = self._problem(key, sender, envelope)
+        if problem is not None:
+            return problem
+        return envelope.payload, Speaker.of(sender.role, sender.name, envelope.head)
 
-    def _overtaken(self, key: str, card: Card, envelope: Envelope) -> RefusedMessage | None:
+    def _problem(self, key: str, sender: Member, envelope: Envelope) -> RefusedMessage | None:
+        """Why it is not that member's newest word there; else it is heard."""
+        if not envelope.is_from(sender.public_key, Address(self.members.authority, key)):
+            return RefusedMessage.FORGED
+        return self._overtaken(key, sender, envelope)
+
+    def _overtaken(self, key: str, sender: Member, envelope: Envelope) -> RefusedMessage | None:
         """Why the member's word does not count, if its number is the reason; else it is heard."""
         number = envelope.head.number
         now_s, offset_s = self._clock_s(), self._unix_offset_s
         unix_s = None if offset_s is None else now_s + offset_s
         # A ground whose computer's clock was wrong once would be out of reach in flight.
-        is_robot = card.role is Role.ROBOT
-        is_own = card.fingerprint == self.card.fingerprint and is_robot
+        is_robot = sender.role is Role.ROBOT
+        fingerprint = envelope.head.fingerprint
+        is_own = fingerprint == self._own.fingerprint and is_robot
         with self._lock:
             if is_own and number.start <= self._start:
                 # A robot's own word, said again. Another program with this key, if there is one
@@ -494,77 +417,20 @@ class SignedGuard:
             if is_own:
                 self._own_said_s = now_s
             if is_robot and unix_s is not None and number.start > 1e3 * unix_s + _MOST_AHEAD_MS:
-                self._ahead_s[card.fingerprint] = now_s
+                self._ahead_s[fingerprint] = now_s
                 return RefusedMessage.START_AHEAD
-            heard = self._heard[card.fingerprint, key]
+            heard = self._heard[fingerprint, key]
             if heard.newest.is_older(number, now_s, unix_s):
                 heard.hear_behind(number, now_s)
                 return RefusedMessage.REPLAYED
-            if number.start != heard.newest.number.start:
-                self._show_soon = True  # A program that just began knows nobody's card.
-            heard.hear(number, now_s)
+            heard.hear(envelope.head, now_s)
         return None
-
-    def _receive_card(self, topic: Topic, key: str, data: bytes) -> bool:
-        envelope = read_envelope(data)
-        reason = (
-            RefusedMessage.NO_ENVELOPE if envelope is None else self._shown(topic, key, envelope)
-        )
-        # Shown again and again, it is no less the member's, but it may be of an earlier start.
-        if reason not in (None, RefusedMessage.REPLAYED):
-            self._refuse(reason, key)
-        return reason is None
-
-    def _shown(self, topic: Topic, key: str, envelope: Envelope) -> RefusedMessage | None:
-        """A card in its owner's envelope: why it is not looked at, if it is not."""
-        try:
-            card = verified(Card, envelope.payload, self._authority)
-        except CardError:
-            return RefusedMessage.FORGED
-        if not _is_of(card, topic, key):
-            return RefusedMessage.NOT_ALLOWED
-        address = Address(self._authority, key)
-        if card.fingerprint != envelope.head.fingerprint or not envelope.is_from(
-            card.public_key, address
-        ):
-            return RefusedMessage.FORGED
-        with self._lock:
-            known = self._members.get(card.member)
-            if known is None and len(self._members) >= _MOST_CARDS:
-                return RefusedMessage.UNKNOWN_KEY
-            if known is None or known.serial < card.serial:
-                if known is not None:
-                    del self._cards[known.fingerprint]
-                self._members[card.member] = self._cards[card.fingerprint] = card
-                self._show_soon = True
-        if card.fingerprint in self._revoked:
-            return RefusedMessage.REVOKED
-        if card.fingerprint not in self._cards:
-            return RefusedMessage.NOT_ALLOWED  # Somebody has a newer card in its place.
-        return self._overtaken(key, card, envelope)
-
-    def _receive_revocations(self, key: str, data: bytes) -> None:
-        if data != self.revocations and not self.hear_revocations(data):
-            self._refuse(RefusedMessage.FORGED, key)
-
-    def hear_revocations(self, data: bytes) -> bool:
-        """Take a signed list if it is a newer one; whether the authority has signed it at all."""
-        try:
-            revocations = verified(Revocations, data, self._authority)
-        except CardError:
-            return False
-        with self._lock:
-            if revocations.count > self._revocations.count:
-                self._revocations, self.revocations = revocations, data
-                self._revoked = frozenset(map(bytes.fromhex, revocations.fingerprints))
-        return True
 
     def _refuse(self, reason: RefusedMessage, key: str) -> None:
         with self._lock:
             self._refused[reason] += 1
             first = self._refused[reason] == 1
-        # Of whoever comes the card is not known at first.
-        if first and reason is not RefusedMessage.UNKNOWN_KEY:
+        if first:
             log.warning("a message is not listened to", why=reason.value, key=key)
 
 
@@ -577,7 +443,6 @@ class _SealingLink:
 
     def publish(self, topic: Topic, data: bytes) -> None:
         """Send to whoever listens; it may be lost."""
-        self._guard.introduce()
         self._link.publish(topic, self._guard.seal(topic, data))
 
     def is_claimed(self, robot_id: int) -> bool:
@@ -592,24 +457,26 @@ class _SealingLink:
         """How many messages it did not look at."""
         return self._link.refused()
 
-    @property
-    def sends_again(self) -> bool:
-        """Whether what is lost on its way is said once more."""
-        return self._link.sends_again
 
-
-def _knock_key(card: Card, place: str) -> str:
+def _knock_key(sender: Member, place: str) -> str:
     """Return the key that a knock is signed for: it names the destination, against replay."""
-    return f"{'ground' if card.robot_id is None else f'robot/{card.robot_id}'}/knock/{place}"
+    return f"{_prefix(sender)}/knock/{place}"
 
 
-def _is_of(card: Card, topic: Topic, key: str) -> bool:
-    """Whether that is the member's own key."""
-    if card.role is Role.ROBOT:
-        return key == f"robot/{card.robot_id}/{topic.name}"
-    return key == f"ground/{topic.name}"
+def _key(sender: Member, topic: Topic) -> str:
+    return f"{_prefix(sender)}/{topic.name}"
 
 
-def _may_say(card: Card, topic: Topic, key: str) -> bool:
+def _prefix(sender: Member) -> str:
+    return "ground" if sender.robot_id is None else f"robot/{sender.robot_id}"
+
+
+def _may_say(sender: Member, topic: Topic, key: str) -> bool:
     """An observer may ask for a hold, and nothing else."""
-    return _is_of(card, topic, key) and (card.role is not Role.OBSERVER or topic == HOLD)
+    return key == _key(sender, topic) and (sender.role is not Role.OBSERVER or topic == HOLD)
+
+
+def _compared(theirs: int, own: int) -> str:
+    if theirs == own:
+        return f"another {theirs}"
+    return f"{theirs}, which is {'newer' if theirs > own else 'older'}"

@@ -31,7 +31,8 @@ class CheckCode(_Code):
     TIME_NOT_KNOWN = "time_not_known"
     GROUND_NOT_HEARD = "ground_not_heard"
     GROUND_SILENT = "ground_silent"
-    CARD_NOT_GOOD = "card_not_good"
+    NOT_A_MEMBER = "not_a_member"
+    MEMBERS_DIFFER = "members_differ"
     NO_FRESH_ANSWER = "no_fresh_answer"
     # The vehicle.
     AUTOPILOT_NOT_CONNECTED = "autopilot_not_connected"
@@ -186,6 +187,8 @@ class ReasonCode(_Code):
     WATCHDOG_ENDED = "watchdog_ended"
     LOG_NOT_WRITTEN = "log_not_written"
     IDENTITY_NOT_WRITTEN = "identity_not_written"
+    NOT_A_MEMBER = "not_a_member"
+    MEMBERS_DIFFER = "members_differ"
     GROUND_NOT_UNDERSTOOD = "ground_not_understood"
 
 

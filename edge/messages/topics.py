@@ -49,13 +49,8 @@ STATE = Topic("state", "ground", "GroundState", 5.0, 500, 2**16, "now", "ground"
 HOLD = Topic("hold", "ground", "Hold", 5.0, 500, 2**14, "now", None, 50)
 ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")
 WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 50, 400_000, "later", None, 5)
-# Who is a member, and whose key is not good any more: signed by the fleet's authority. While
-# somebody is new, a robot shows its card more often.
-CARD = Topic("card", "robot", "Card", 0.1, 10, 2**11, "now", None)
-GROUND_CARD = Topic("card", "ground", "Card", 0.5, 100, 2**11, "now", None, 10)
-REVOKED = Topic("revoked", "ground", "Revocations", 0.5, 100, 2**15, "now", None, 10)
 
-TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, HOLD, ORDER, WORLD, CARD, GROUND_CARD, REVOKED)
+TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, HOLD, ORDER, WORLD)
 
 # By TCP a state goes to each robot by itself: so many of them a second are enough for a fleet, but
 # each robot needs some before it takes the ground for lost.
@@ -69,10 +64,6 @@ def state_hz(robots: float) -> float:
 
 class Link(Protocol):
     """The radio. Called from any thread; nothing waits, and nothing raises."""
-
-    @property
-    def sends_again(self) -> bool:
-        """Whether it says once more what was lost on its way, as TCP does."""
 
     def publish(self, topic: Topic, data: bytes) -> None:
         """Send to whoever listens; it may be lost."""
@@ -110,18 +101,27 @@ class TlsFiles(NamedTuple):
     key: str
 
 
+class GroupKeys(NamedTuple):
+    """Keys of a multicast group, 32 bytes each: all that are heard, the newest first.
+
+    `spoken` is the one of them that is spoken with.
+    """
+
+    heard: tuple[bytes, ...]
+    spoken: bytes
+
+
 class Group(NamedTuple):
     """A multicast group in which robots tell each other what they say.
 
-    `interface` is the robot's own IPv4 address, by whose network it is reached. `keys` are the
-    fleet's, 32 bytes each: it speaks with the first, and hears all. Without `is_secret` they are no
-    secret.
+    `interface` is the robot's own IPv4 address, by whose network it is reached. `keys` returns the
+    fleet's, as they are now. Without `is_secret` they are no secret.
     """
 
     address: str
     port: int
     interface: str
-    keys: tuple[bytes, ...]
+    keys: Callable[[], GroupKeys]
     is_secret: bool
 
 

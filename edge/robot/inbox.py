@@ -10,8 +10,8 @@ from dataclasses import replace
 from threading import Lock
 from typing import NamedTuple
 
-from edge.identity.card import Role
 from edge.identity.guard import Speaker
+from edge.identity.members import Role
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import (
     HOLD_LASTS_S,

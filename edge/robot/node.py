@@ -242,8 +242,7 @@ class RobotNode:
 
     def policy_step(self) -> None:
         """Hear the neighbours, decide where to fly, tell the neighbours; the policy's rate."""
-        on_ground = self._control.flight.state in ON_GROUND
-        tick = self._pac.infer(self._ports.clock.monotonic_s(), on_ground=on_ground)
+        tick = self._pac.infer(self._ports.clock.monotonic_s(), on_ground=self.on_ground)
         self._tell_once(self._pac.problem)
         if tick is None:
             return
@@ -307,10 +306,9 @@ class RobotNode:
         control.px4_change = self.readiness.px4_change
         now_s = self._ports.clock.monotonic_s()
         # A robot's own wall clock may be wrong: there is no internet on a field.
-        ground_unix_s, own_unix_s = self._inbox.ground_unix_s(now_s), self._ports.clock.unix_s()
-        unix_now_s = ground_unix_s or own_unix_s
+        ground_unix_s = self._inbox.ground_unix_s(now_s)
         if ground_unix_s is not None:
-            self._guard.hear_time(max(ground_unix_s, own_unix_s))
+            self._guard.hear_time(max(ground_unix_s, self._ports.clock.unix_s()))
         time = self._pac.clock.at(now_s)
         control.checks = self.readiness.checks(
             now_s,
@@ -323,7 +321,8 @@ class RobotNode:
             fell_silent=control.fell_silent,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),
-            card_problem=self._guard.card_problem(unix_now_s),
+            is_listed=self._guard.is_listed(),
+            members_differ=self._guard.members_differ(),
             ground_age_s=control.ground_age_s(now_s),
             time_uncertainty_s=None if time is None else time.uncertainty_s,
             answer_age_s=self._pac.action_age_s(now_s),
@@ -475,12 +474,22 @@ class RobotNode:
         if self.identity_problem:
             text = f"what the next start has to know is not written: {self.identity_problem}"
             alarms.append(Reason(ReasonCode.IDENTITY_NOT_WRITTEN, text))
+        if not self._guard.is_listed():
+            text = "its key is not in the fleet's list of members: nobody hears it"
+            alarms.append(Reason(ReasonCode.NOT_A_MEMBER, text))
+        if differ := self._guard.members_differ():
+            alarms.append(Reason(ReasonCode.MEMBERS_DIFFER, differ))
         if self._inbox.ground_refusal:
             text = f"the ground is not understood: {self._inbox.ground_refusal}"
             alarms.append(Reason(ReasonCode.GROUND_NOT_UNDERSTOOD, text))
         return tuple(alarms)
 
     # Besides
+
+    @property
+    def on_ground(self) -> bool:
+        """Whether it is in a state of the ground."""
+        return self._control.flight.state in ON_GROUND
 
     @property
     def failed_checks(self) -> tuple[FailedCheck, ...] | None:

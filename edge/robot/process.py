@@ -42,7 +42,7 @@ from edge.identity.group import MOST_BYTES, MOST_FRAGMENTS, frames, key_of_open_
 from edge.identity.guard import Unguarded
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import LoopStatus
-from edge.messages.topics import Group, Knocking, Link, LinkSetting
+from edge.messages.topics import Group, GroupKeys, Knocking, Link, LinkSetting
 from edge.policy.family import VerifiedPolicy
 from edge.robot.config import RobotConfig, require_group
 from edge.robot.log import open_log
@@ -119,10 +119,7 @@ def run(config: RobotConfig, stop: Stop) -> None:
         flight = config.flight
         watchdog = parts.enter_context(new_watchdog(flight.command_timeout_s, flight.hover_land_s))
         # 5. The robot itself.
-        identity = _identity(
-            config,
-            lambda folder: load_identity(folder, fleet=config.fleet, unix_s=clock.unix_s()),
-        )
+        identity = _identity(config, partial(load_identity, unix_s=clock.unix_s()))
         signed = None if identity is None else identity.guard(clock.monotonic_s)
         node = RobotNode(
             config,
@@ -143,10 +140,10 @@ def run(config: RobotConfig, stop: Stop) -> None:
         link = parts.enter_context(_open_link(config, node, config.robot_id, identity, signed))
         node.attach(link)
         # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
-        keep_news = None
+        take_up = None
         if identity is not None and signed is not None:
-            keep_news = partial(identity.keep, signed)
-        program = _Program(config, node, vehicle, watchdog, recorder, link, keep_news)
+            take_up = partial(identity.take_up, signed)
+        program = _Program(config, node, vehicle, watchdog, recorder, link, take_up)
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
         libc.malloc_trim(0)  # What verification took goes back to the system.
@@ -167,17 +164,12 @@ def _open_vehicle(config: RobotConfig) -> AbstractContextManager[OpenVehicle]:
     return open_vehicle(autopilot.type, setting)
 
 
-def _identity(config: RobotConfig, load: Callable[[Path], Identity]) -> Identity | None:
+def _identity(config: RobotConfig, load: Callable[..., Identity]) -> Identity | None:
     """This robot's identity in its fleet; None if there is none. Raises ConfigError or OSError."""
     if not config.identity.folder:
         return None
-    identity = load(Path(config.identity.folder))
-    card = identity.card
-    if card.robot_id != config.robot_id:
-        raise ConfigError(
-            f"{identity.folder}: is {card.role} {card.name}'s, not robot {config.robot_id}'s"
-        )
-    return identity
+    folder = Path(config.identity.folder)
+    return load(folder, fleet=config.fleet, robot_id=config.robot_id)
 
 
 def _open_link(
@@ -202,19 +194,26 @@ def _group(config: RobotConfig, identity: Identity | None) -> Group | None:
     if not config.link.group:
         return None
     address, port = require_group("group", config.link.group)
-    keys = (key_of_open_fleet(config.fleet),) if identity is None else identity.group_keys
-    if not keys:
-        raise ConfigError(
-            f"{config.identity.folder}: {GROUP_KEYS} is missing, which multicast needs: run `lpac "
-            "fleet up`"
-        )
+    open_key = key_of_open_fleet(config.fleet)
+
+    def keys() -> GroupKeys:
+        if identity is None:
+            return GroupKeys((open_key,), open_key)
+        if identity.group_keys is None:
+            raise ConfigError(
+                f"{config.identity.folder}: {GROUP_KEYS} is missing, which multicast needs: run "
+                "`lpac fleet up`"
+            )
+        return identity.group_keys
+
+    keys()
     return Group(address, port, config.link.interface, keys, is_secret=identity is not None)
 
 
 class _Program:
     """The threads of a running robot. The main thread calls its methods.
 
-    `keep_news` writes what is to be known of the fleet at the next start.
+    `take_up` follows the fleet's list of members, and writes the number of this start.
     """
 
     def __init__(
@@ -225,7 +224,7 @@ class _Program:
         watchdog: Watchdog,
         recorder: FlightLog,
         link: Link,
-        keep_news: Callable[[], None] | None,
+        take_up: Callable[..., None] | None,
     ) -> None:
         self._config = config
         self._node = node
@@ -233,7 +232,7 @@ class _Program:
         self._watchdog = watchdog
         self._link = link
         self._recorder = recorder
-        self._keep_news = keep_news
+        self._take_up = take_up
         rates = config.rates
         self._loops = (
             Loop("control", 1.0 / rates.control_hz, node.control_step),
@@ -298,15 +297,15 @@ class _Program:
         log.error("the autopilot did not answer", action=action)
 
     def _write_step(self) -> None:
-        self._recorder.flush()
-        if self._keep_news is not None:
+        if self._take_up is not None:
             try:
-                self._keep_news()
+                self._take_up(in_flight=not self._node.on_ground)
                 self._node.identity_problem = ""
             except OSError as error:
                 if not self._node.identity_problem:
                     log.error("identity not written", why=str(error))
                 self._node.identity_problem = f"{error.filename}: {file_error_in_words(error)}"
+        self._recorder.flush()
 
     def _status_step(self) -> None:
         now_s = time.monotonic()
@@ -394,7 +393,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
         parts.enter_context(_robot_lock(config))
         show("error")
         clock = SystemClock()
-        identity = _identity(config, lambda folder: listening_identity(folder, fleet=config.fleet))
+        identity = _identity(config, listening_identity)
         vehicle, setup, _ = parts.enter_context(_open_vehicle(config))
         looking = _OnlyLooking(vehicle)
         node = RobotNode(

@@ -17,7 +17,6 @@ from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
 from edge.flight.preflight import PreflightInputs, failed_checks
 from edge.flight.state import Px4Change, Robot
-from edge.identity.guard import CardProblem
 from edge.messages.beacon import HeardBeacon, Neighbour
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
@@ -144,7 +143,8 @@ class Readiness:
         fell_silent: Sequence[Neighbour],
         duplicate: bool,
         watchdog_alive: bool,
-        card_problem: CardProblem | None,
+        is_listed: bool,
+        members_differ: str,
         ground_age_s: float,
         time_uncertainty_s: float | None,
         answer_age_s: float | None,
@@ -189,9 +189,11 @@ class Readiness:
         if not watchdog_alive:
             text = "watchdog has ended: start this robot's program again"
             failed = (*failed, FailedCheck(CheckCode.WATCHDOG_ENDED, text))
-        if card_problem is not None:
-            text = f"its card in the fleet is {card_problem.value}: enroll this robot again"
-            failed = (*failed, FailedCheck(CheckCode.CARD_NOT_GOOD, text))
+        if not is_listed:
+            text = "its key is not in the fleet's list of members: enroll this robot again"
+            failed = (*failed, FailedCheck(CheckCode.NOT_A_MEMBER, text))
+        if members_differ:
+            failed = (*failed, FailedCheck(CheckCode.MEMBERS_DIFFER, members_differ))
         return Checks(failed, now_s, assignment)
 
     def _read(self) -> bool:

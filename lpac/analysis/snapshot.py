@@ -91,7 +91,7 @@ class FleetSnapshot:
     `commander` is the operator in command, "" if there is none yet; `ground` is the state that the
     commander publishes. `running` are descriptions of the running commands. `commander_age_s` is
     the time since the commander was heard, 0 if it is this station. `shares_name`: another station
-    uses this station's name.
+    uses this station's name. `members_problem`: fault of the list of members, "" if there is none.
     """
 
     unix_time_s: float
@@ -101,6 +101,7 @@ class FleetSnapshot:
     running: tuple[str, ...] = ()
     commander_age_s: float = 0.0
     shares_name: bool = False
+    members_problem: str = ""
 
 
 EventKind = Literal["command", "result", "refusal", "state", "commander", "presence"]

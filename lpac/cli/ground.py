@@ -29,7 +29,7 @@ def ground(
     fleet: Fleet = DEFAULT_FLEET,
     name: Annotated[
         str,
-        typer.Option("--name", help="This station's name; by default its card's, or user@host."),
+        typer.Option("--name", help="This station's name; by default its member's, or user@host."),
     ] = "",
 ) -> None:
     """Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.

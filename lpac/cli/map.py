@@ -85,7 +85,7 @@ def _tls(config: "FleetConfig", host: str) -> "ssl.SSLContext":
     import datetime
     import ssl
 
-    from lpac.fleet.cards import open_authority
+    from lpac.fleet.members import open_authority
     from lpac.fleet.web_certificate import web_certificate
     from lpac.ground.map.access import reached_at
 

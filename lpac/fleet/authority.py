@@ -1,22 +1,20 @@
-"""A fleet's authority: it says who is a member, and whose key is not good any more.
+"""A fleet's authority: the secret by which certificates are made, and the list of members.
 
-Its folder is the operator's own identity too (see `edge.drivers.identity_folder`), with two files
-more: `authority.key`, the secret that the whole fleet's safety hangs on, and `members.json`, what
-was issued. Cards are what robots decide by; certificates of the same keys let their holders in.
+Its folder is the operator's own identity too (see `edge.drivers.identity_folder`), with the secret
+`authority.key`, and the group's keys. The list is what robots decide by, and whoever can write it
+there (over SSH) decides; certificates of the same keys let their holders in.
 """
 
 import datetime
 import fcntl
 import os
 import secrets
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import (
@@ -30,58 +28,27 @@ from edge.drivers.identity_folder import (
     AUTHORITY_PEM,
     CERTIFICATE_PEM,
     GROUP_KEYS,
-    IDENTITY_JSON,
     KEY_PEM,
+    MEMBERS,
     group_keys_text,
-    identity_json,
-    load_card,
+    listening_identity,
+    read_group_keys,
+    read_members,
 )
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID
-from edge.identity.card import MOST_REVOKED, Card, Revocations, Role, signed
 from edge.identity.group import KEY_BYTES
-from edge.identity.signature import Signer, fingerprint
+from edge.identity.members import Member, MemberName, Members, Role
 from edge.robot.config import PlainName
 
 _SECRET = "authority.key"
-_MEMBERS = "members.json"
-_REVOKED = "revoked"
 # The newest, and the one that robots have that were not given it yet.
 _MOST_KEYS = 2
-_VALID_S = 2.0 * 365.0 * 86400.0
 # Flight depends on no wall clock: a certificate lets its holder in whatever the time is.
 _ALWAYS = (datetime.datetime(1970, 1, 1), datetime.datetime(9999, 12, 31, 23, 59, 59))
 
 
 class AuthorityError(ValueError):
     """It cannot be done; one line says why, and what to do."""
-
-
-@dataclass(frozen=True, slots=True)
-class Member:
-    """A key that was issued a card."""
-
-    role: Role
-    name: str
-    robot_id: int | None
-    public_key: bytes
-    serial: int
-    expires_unix_s: float
-    revoked: bool = False
-
-    @property
-    def fingerprint(self) -> str:
-        """Its key's, in hexadecimal digits."""
-        return fingerprint(self.public_key).hex()
-
-
-class _Ledger(msgspec.Struct):
-    fleet: str
-    serial: int = 0
-    revocations: int = 0
-    members: list[Member] = []
-    # Hexadecimal digits, the newest first; somebody who has the first is a member no more, if so.
-    group_keys: list[str] = []
-    group_key_leaked: bool = False
 
 
 class Issued(NamedTuple):
@@ -109,43 +76,49 @@ class Authority:
         except FileNotFoundError:
             raise AuthorityError(
                 f"{folder}: has no authority of fleet {fleet}: make one with `lpac fleet init`, or "
-                f"bring {_SECRET} and {_MEMBERS} from the laptop or the backup that has them"
+                f"bring the folder from the laptop or the backup that has it"
             ) from None
         if not isinstance(key, Ed25519PrivateKey):
             raise AuthorityError(f"{path}: is no Ed25519 key")
         self._key = key
-        self._signer = Signer(key.private_bytes_raw())
-        if self._read().fleet != fleet:
-            raise AuthorityError(f"{folder}: is of fleet {self._read().fleet}, not of {fleet}")
+        if self.members.fleet != fleet:
+            raise AuthorityError(f"{folder}: is of fleet {self.members.fleet}, not of {fleet}")
 
     @property
-    def public_key(self) -> bytes:
-        """By which members tell each other's cards."""
-        return self._signer.public_key
-
-    def members(self) -> list[Member]:
-        """All that were issued a card, in that order."""
-        return self._read().members
+    def members(self) -> Members:
+        """The list as it is now. Raises AuthorityError."""
+        try:
+            return read_members(self.folder)
+        except FileNotFoundError:
+            raise AuthorityError(
+                f"{self.folder / MEMBERS}: is missing: bring it from the backup"
+            ) from None
+        except ValueError as error:
+            raise AuthorityError(f"{self.folder}: {error}") from None
 
     def issue(
-        self, role: Role, name: str, public_key: bytes, robot_id: int | None = None
+        self,
+        role: Role,
+        name: str,
+        public_key: bytes,
+        robot_id: int | None = None,
+        *,
+        renew_group_key: bool = True,
     ) -> Issued:
-        """A card and a certificate for a key. An earlier key of the same member is revoked.
+        """Put a key on the list, and make its certificate. An earlier key of that member leaves.
 
+        With a robot's earlier key the group's leaves, too, unless that is left to the caller.
         Raises AuthorityError.
         """
         if robot_id is not None and not 0 <= robot_id <= MAX_CERTIFIED_ID:
             raise AuthorityError(f"robot_id = {robot_id}: must be from 0 to {MAX_CERTIFIED_ID}")
-        with self._changed() as ledger:
-            ledger.serial += 1
-            member = Member(role, name, robot_id, public_key, ledger.serial, time.time() + _VALID_S)
-            before = [m for m in ledger.members if _is_same(m, member)]
-            revoked = [m for m in before if m.public_key != public_key and not m.revoked]
-            kept = [m for m in ledger.members if m not in before or m in revoked]
-            ledger.members = [replace(m, revoked=True) if m in revoked else m for m in kept]
-            ledger.members.append(member)
-            if revoked:
-                self._write_revoked(ledger)
+        require(MemberName, name, "name")
+        member = Member(role, name, robot_id, public_key)
+        with self._locked():
+            known = self.members.members
+            others = [m for m in known if m.place != member.place and m.public_key != public_key]
+            if member not in known:
+                self._write((*others, member), renew_group_key=renew_group_key)
         return Issued(member, self.files(member))
 
     def files(self, member: Member) -> dict[str, bytes]:
@@ -155,102 +128,61 @@ class Authority:
             common_name = f"robot-{member.robot_id}"
         key = Ed25519PublicKey.from_public_bytes(member.public_key)
         return {
-            IDENTITY_JSON: self.identity_json(member),
             CERTIFICATE_PEM: _certificate(common_name, self.fleet, key, self._key),
-            AUTHORITY_PEM: _certificate(
-                "authority", self.fleet, self._key.public_key(), self._key, is_authority=True
-            ),
-            _REVOKED: self.revocations,
-            **({GROUP_KEYS: self.group_keys()} if member.role is Role.ROBOT else {}),
+            AUTHORITY_PEM: (self.folder / AUTHORITY_PEM).read_bytes(),
+            **self.shared_files(is_robot=member.role is Role.ROBOT),
         }
 
-    def group_keys(self) -> bytes:
-        """Keys of the multicast group for robots: the file of that name."""
-        return group_keys_text(list(map(bytes.fromhex, self._read().group_keys)))
-
-    def renew_group_key(self) -> bool:
-        """Make a new key of the group if somebody who has the last is a member no more.
-
-        Whether there is one. Robots hear each other by the one before, too, until all have it.
-        """
-        with self._changed() as ledger:
-            leaked = ledger.group_key_leaked or not ledger.group_keys
-            if leaked:
-                ledger.group_keys = [secrets.token_hex(KEY_BYTES), *ledger.group_keys][:_MOST_KEYS]
-                ledger.group_key_leaked = False
-        return leaked
-
-    def identity_json(self, member: Member) -> bytes:
-        """The member's file of that name, with its card."""
-        card = Card(
-            self.fleet, member.role, member.name, member.public_key, member.serial,
-            member.expires_unix_s, member.robot_id,
-        )  # fmt: skip
-        return identity_json(self.fleet, self.public_key, signed(card, self._signer))
-
-    @property
-    def revocations(self) -> bytes:
-        """The signed list of revoked keys."""
-        return (self.folder / _REVOKED).read_bytes()
+    def shared_files(self, *, is_robot: bool) -> dict[str, bytes]:
+        """The files that all have, as they are now: the list, and of robots the group's keys."""
+        names = (GROUP_KEYS, MEMBERS) if is_robot else (MEMBERS,)
+        return {name: (self.folder / name).read_bytes() for name in names}
 
     def own_name(self) -> str | None:
         """Of the operator in this very folder; None if there is nobody's identity."""
         try:
-            card = load_card(self.folder, self.public_key)
+            return listening_identity(self.folder, fleet=self.fleet).membership.own.name
         except (OSError, ConfigError):
             return None
-        return card.name
 
     def named(self, name: str) -> list[Member]:
-        """The members of that name, revoked ones too. Raises AuthorityError if there are none."""
-        members = self.members()
+        """The members of that name. Raises AuthorityError if there are none."""
+        members = self.members.members
         known = [m for m in members if m.name == name]
         if not known:
             names = ", ".join(sorted({m.name for m in members})) or "nobody"
             raise AuthorityError(f"{name}: is no member of fleet {self.fleet}; known: {names}")
         return known
 
-    def revoke(self, name: str) -> list[Member]:
-        """Revoke all keys of the member of that name; those that were. Raises AuthorityError."""
-        known = self.named(name)
-        with self._changed() as ledger:
-            ledger.members = [
-                replace(m, revoked=True) if m.name == name else m for m in ledger.members
-            ]
-            self._write_revoked(ledger)
-        return known
+    def revoke(self, name: str) -> None:
+        """Take the members of that name off the list. Raises AuthorityError."""
+        self.named(name)
+        with self._locked():
+            self._write(tuple(m for m in self.members.members if m.name != name))
 
-    def _write_revoked(self, ledger: _Ledger) -> None:
-        fingerprints = tuple(dict.fromkeys(m.fingerprint for m in ledger.members if m.revoked))
-        if len(fingerprints) > MOST_REVOKED:
-            raise AuthorityError(
-                f"{len(fingerprints)} keys are revoked, and a list holds {MOST_REVOKED}: make a "
-                "new authority"
-            )
-        ledger.revocations += 1
-        ledger.group_key_leaked = True
-        data = signed(Revocations(ledger.revocations, fingerprints), self._signer)
-        write_file(self.folder / _REVOKED, data, 0o644)
+    def renew_group_key(self) -> None:
+        """Make a new key of the group. Robots hear each other by the one before, too."""
+        with self._locked():
+            self._renew_group_key()
 
-    def _read(self) -> _Ledger:
-        path = self.folder / _MEMBERS
-        try:
-            return msgspec.json.decode(path.read_bytes(), type=_Ledger)
-        except FileNotFoundError:
-            raise AuthorityError(f"{path}: is missing: bring it from the backup") from None
-        except msgspec.MsgspecError as error:
-            raise AuthorityError(f"{path}: {error}") from None
+    def _renew_group_key(self) -> None:
+        path = self.folder / GROUP_KEYS
+        keys = (secrets.token_bytes(KEY_BYTES), *read_group_keys(path))[:_MOST_KEYS]
+        write_file(path, group_keys_text(keys), 0o600)
+
+    def _write(self, members: tuple[Member, ...], *, renew_group_key: bool = True) -> None:
+        now = self.members
+        later = replace(now, number=now.number + 1, members=members)
+        write_file(self.folder / MEMBERS, later.text.encode(), 0o644)
+        if renew_group_key and _robot_keys(now) - _robot_keys(later):
+            self._renew_group_key()
 
     @contextmanager
-    def _changed(self) -> Iterator[_Ledger]:
-        """Write the changes to members that are made meanwhile, unless something is raised."""
+    def _locked(self) -> Iterator[None]:
+        """Keep other programs from changing the list meanwhile."""
         with (self.folder / _SECRET).open("rb") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            ledger = self._read()
-            yield ledger
-            write_file(
-                self.folder / _MEMBERS, msgspec.json.format(msgspec.json.encode(ledger)), 0o600
-            )
+            yield
 
 
 def create_authority(folder: Path, fleet: str) -> Authority:
@@ -260,9 +192,11 @@ def create_authority(folder: Path, fleet: str) -> Authority:
         raise AuthorityError(f"{folder}: has an authority already")
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     key = Ed25519PrivateKey.generate()
-    ledger = _Ledger(fleet, revocations=1, group_keys=[secrets.token_hex(KEY_BYTES)])
-    write_file(folder / _MEMBERS, msgspec.json.encode(ledger), 0o600)
-    write_file(folder / _REVOKED, signed(Revocations(1), Signer(key.private_bytes_raw())), 0o644)
+    members = Members(fleet, 1, key.public_key().public_bytes_raw())
+    write_file(folder / MEMBERS, members.text.encode(), 0o644)
+    write_file(folder / GROUP_KEYS, group_keys_text([secrets.token_bytes(KEY_BYTES)]), 0o600)
+    certificate = _certificate("authority", fleet, key.public_key(), key, is_authority=True)
+    write_file(folder / AUTHORITY_PEM, certificate, 0o644)
     write_file(folder / _SECRET, _pem(key), 0o600)
     return Authority(folder, fleet)
 
@@ -285,10 +219,8 @@ def new_member(
     return issued.member
 
 
-def _is_same(one: Member, other: Member) -> bool:
-    if one.role is not other.role:
-        return False
-    return one.name == other.name if one.robot_id is None else one.robot_id == other.robot_id
+def _robot_keys(members: Members) -> set[bytes]:
+    return {m.public_key for m in members.members if m.role is Role.ROBOT}
 
 
 def _certificate(

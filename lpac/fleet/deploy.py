@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence, Set
 from typing import Any, NamedTuple
 
 from lpac.fleet.hold import Held, Report, earlier_than, hold
+from lpac.fleet.members import bring_members
 from lpac.fleet.program import require_disarmed
 from lpac.fleet.release import Release
 from lpac.fleet.session import Done, FleetError, RemoteError, Session, rsync
@@ -53,6 +54,7 @@ async def deploy(
     """
     async with hold(config, robot, report) as held:
         before, session = held.found, held.session
+        await bring_members(session, config)
         if before["machine"] != release.image.machine:
             raise RemoteError(
                 f"it is {before['machine']}, and the image is for {release.image.machine}: "

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from edge.core.counted import counted
-from edge.core.schema import ConfigError
-from edge.drivers.identity_folder import card_in
+from edge.drivers.identity_folder import read_members
+from edge.identity.members import Role, parse_members
 from edge.messages.codes import CheckCode, FailedCheck, texts
 from lpac.fleet import probes
 from lpac.fleet.deploy import lpac_inside
@@ -330,20 +330,22 @@ def _identity(its: _Judged) -> Finding:
     return ok(f"robot id {its.robot.robot_id} of fleet {its.config.fleet}")
 
 
-def _card(its: _Judged) -> Finding:
+def _member(its: _Judged) -> Finding:
     if its.config.keys is None:
         found = "insecure: whoever is on the network can fly it"
         return warning(found, f"take insecure out of {its.config.path.name}")
-    if its.facts["card"] is None:
-        return failed("it has no card of the fleet", its.enroll)
+    if its.facts["members"] is None:
+        return failed("it has no list of the fleet's members", its.enroll)
     try:
-        own = card_in(its.facts["card"], its.config.keys)
-    except (OSError, ConfigError) as error:
+        here, there = read_members(its.config.keys), parse_members(its.facts["members"])
+    except (OSError, ValueError) as error:
         return failed(str(error), its.enroll)
-    if own.robot_id != its.robot.robot_id:
-        return failed(f"its card is {own.name}'s", its.enroll)
-    until = time.strftime("%Y-%m-%d", time.gmtime(own.expires_unix_s))
-    return ok(f"a member of fleet {own.fleet} until {until}")
+    if (Role.ROBOT, str(its.robot.robot_id)) not in {member.place for member in here.members}:
+        return failed("it is not in the list of members", its.enroll)
+    if there != here:
+        return failed(f"its list of members is {there.number}, and here is {here.number}", _UP)
+    count = counted(len(here.members), "member")
+    return ok(f"a member of fleet {here.fleet}: list {here.number}, {count}")
 
 
 def _group(its: _Judged) -> Finding | None:
@@ -724,7 +726,7 @@ def _preflight(its: _Judged) -> Finding:
 
 _CHECKS: dict[str, Callable[[_Judged], Finding | None]] = {
     "enrolled": _identity,
-    "card": _card,
+    "member": _member,
     "group key": _group,
     "release": _release,
     "program": _program,

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from edge.core.address import require_host
 from edge.core.schema import ConfigError
-from lpac.fleet.cards import CardGiven, give_card
 from lpac.fleet.deploy import deploy
 from lpac.fleet.hold import lock, overview
+from lpac.fleet.members import Joined, join
 from lpac.fleet.release import load_common, make_release
 from lpac.fleet.session import (
     FleetError,
@@ -99,7 +99,7 @@ async def enroll(
             robot = config.robots[name]
         on_step(EnrolStep.of(path.name, not was_there))
         on_step(await set_identity(session, wanted, found))
-        on_step(_card_step(config, await give_card(session, config, robot, operator)))
+        on_step(_member_step(config, await join(session, config, robot, operator)))
         on_step(await set_vision_hub(session, robot))
         on_step(await retire(session, robot, config.predecessors, say))
     step = await _release(config, robot, say)
@@ -268,15 +268,15 @@ async def _release(config: FleetConfig, robot: RobotHost, say: Say) -> EnrolStep
     return EnrolStep("release", "done", ("as a spare's: nothing was started",))
 
 
-def _card_step(config: FleetConfig, given: CardGiven) -> EnrolStep:
-    if given.outcome is None:
+def _member_step(config: FleetConfig, joined: Joined) -> EnrolStep:
+    if joined.outcome is None:
         why = "insecure = true: whoever is on the network can fly it" if config.insecure else ""
-        return EnrolStep("card", "skipped", (why,) if why else ())
+        return EnrolStep("member", "skipped", (why,) if why else ())
     notes: tuple[str, ...] = ()
-    if given.new_authority is not None:
+    if joined.new_authority is not None:
         notes = (
-            f"made the fleet's keys: {given.new_authority}",
+            f"made the fleet's keys: {joined.new_authority}",
             "keep a copy of that folder where nobody else can read it: whoever has it can fly the "
             "fleet, and without it no robot joins",
         )
-    return EnrolStep("card", given.outcome, notes)
+    return EnrolStep("member", joined.outcome, notes)

@@ -300,7 +300,7 @@ _FACTS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "wifi": (_WIFI, wifi_of),
     "vision_hub": (f"cat {VISION_HUB}", vision_hub),
     "containers": (_DOCKER, containers_of),
-    "card": (f"cat {_IDENTITY}/identity.json", _or_none),
+    "members": (f"cat {_IDENTITY}/members", _or_none),
     "group_keys": (f"sha256sum {_IDENTITY}/group-keys", lambda text: _or_none(text.split(" ")[0])),
     "open_ports": ("ss -H -t -u -l -n -p", open_ports),
     "factory_passwords": (_PASSWORDS, str.split),

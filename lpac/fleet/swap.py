@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edge.core.schema import ConfigError
-from lpac.fleet.cards import give_card
 from lpac.fleet.deploy import Deployed, deploy
 from lpac.fleet.hold import Report, check_identity, hold, overview
+from lpac.fleet.members import join
 from lpac.fleet.program import stop
 from lpac.fleet.release import load_common, make_release
 from lpac.fleet.session import RemoteError, UnreachableError, connect
@@ -36,7 +36,7 @@ async def swap(
 ) -> Swapped:
     """Let `spare` fly instead of `failed`; a repeat finishes what was interrupted.
 
-    The spare is looked at, and has a good card, before anything is changed, and the failed robot is
+    The spare is looked at, and is a member, before anything is changed, and the failed robot is
     stopped before the spare gets its place; `operator` is as for `enroll`. Raises ConfigError, or
     FleetError if the failed robot is armed or the spare cannot have the release; ValueError or
     OSError if there is no release.
@@ -47,8 +47,8 @@ async def swap(
     common = load_common(config)
     report(f"look at {spare}", None)
     async with hold(config, config.robots[spare], report) as held:
-        report(f"card of {spare}", None)
-        await give_card(held.session, config, config.robots[spare], operator)
+        report(f"key of {spare}", None)
+        await join(held.session, config, config.robots[spare], operator)
     report(f"stop {failed}", None)
     silent = await _stop(config, config.robots[failed])
     report(path.name, None)

@@ -12,7 +12,6 @@ from edge.flight.energy import trials
 from edge.identity.group import frames
 from edge.policy.bundle import load_bundle
 from edge.robot.pac import message_bytes
-from lpac.fleet.cards import give_group_keys, has_group_keys
 from lpac.fleet.doctor import (
     GOOD_CLOCK_OFFSET_S,
     Diagnosis,
@@ -22,6 +21,7 @@ from lpac.fleet.doctor import (
     measure_clock,
 )
 from lpac.fleet.hold import Report, lock, visit
+from lpac.fleet.members import bring_members
 from lpac.fleet.operations import Outcome
 from lpac.fleet.program import require_disarmed, start
 from lpac.fleet.session import RemoteError, Session, UnreachableError
@@ -146,11 +146,14 @@ async def _bring_up(
             "its program started by a clock more than a day ahead, and is not listened to: "
             f"`lpac fleet restart --robots {robot.name}`"
         )
+    try:
+        brought = await bring_members(session, config)
+        done += [brought] if brought is not None else []
+    except RemoteError as error:
+        problems.append(str(error))
     if not locked:
         return Arrival(tuple(done), tuple(problems))
     try:
-        if has_group_keys(config) and await give_group_keys(session, config, robot):
-            done.append("it was given a new key of the group")
         service = await session.call("service")
         idle = service["enabled"] and service["active"] != "active"
         if idle and config.slot_of(robot.name) is not None:

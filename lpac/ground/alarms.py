@@ -58,6 +58,7 @@ class AlarmCode(StrEnum):
     COMMANDER_SILENT = "commander_silent"
     HELD_BY_OTHERS = "held_by_others"
     NAME_SHARED = "name_shared"
+    MEMBERS_DIFFER = "members_differ"
     INSECURE = "insecure"
     WORLD_NOT_HERE = "world_not_here"
     NOT_HEARD_YET = "not_heard_yet"
@@ -223,6 +224,8 @@ def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:
     if fleet.snapshot.shares_name:
         text = f"another ground station speaks as {fleet.setup.operator}: two may command by turns"
         yield "critical", AlarmCode.NAME_SHARED, text
+    if fleet.snapshot.members_problem:
+        yield "warning", AlarmCode.MEMBERS_DIFFER, fleet.snapshot.members_problem
     if ground is not None and ground.safety_action_by not in ("", ground.operator):
         held = [n for n, i in fleet.setup.robots.items() if ground.safety_action_for(i) == "hold"]
         text = f"{ground.safety_action_by} asks {counted(len(held), 'robot')} to hold"

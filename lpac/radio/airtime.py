@@ -30,7 +30,7 @@ from edge.core.schema import AtLeastOne, Bounded, NonNegative, Positive, require
 from edge.core.wire import PayloadType
 from edge.identity.envelope import HEAD_BYTES
 from edge.identity.group import DATAGRAM_BYTES, PART_BYTES, frames
-from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATUS, state_hz
+from edge.messages.topics import EXPLORED, MESSAGE, STATUS, state_hz
 
 # How robots' messages travel, in fleets as in the model.
 Transport = Literal["mesh", "multicast"]
@@ -65,7 +65,7 @@ _SEGMENTS_PER_ACK = 2.0
 MESSAGE_BYTES: Mapping[PayloadType, float] = MappingProxyType(
     {"float32": 2576.0, "float16": 1786.0, "int8": 1206.0}
 )
-EXPLORED_BYTES, CARD_BYTES, GROUND_CARD_BYTES = 605.0, 321.0, 331.0
+EXPLORED_BYTES = 605.0
 
 
 def status_bytes(robots: float) -> float:
@@ -111,7 +111,7 @@ class Traffic(Bounded):
     """Traffic of a fleet in flight; sizes are those of sealed messages, before any framing.
 
     `message_bytes` and `message_hz` are of what a robot tells its neighbours, `status_hz` of what
-    it tells the ground. Orders, worlds and revocations are left out: they are sent at moments.
+    it tells the ground. Orders and worlds are left out: they are sent at moments.
 
     Raises ValueError that names an impossible value.
     """
@@ -410,9 +410,7 @@ def _flows(traffic: Traffic, robots: int) -> tuple[_Flow, ...]:
         _Flow("message", "robot", robots, hz, size, others),
         _Flow("status", "robot", robots, traffic.status_hz, status_bytes(robots), 0.0, True),
         _Flow("explored", "robot", robots, EXPLORED.rate_hz, EXPLORED_BYTES, 0.0, True),
-        _Flow("card", "robot", robots, CARD.rate_hz, CARD_BYTES, others, True),
         _Flow("state", "ground", 1.0, state_hz(robots), state_bytes(robots), robots),
-        _Flow("ground card", "ground", 1.0, GROUND_CARD.rate_hz, GROUND_CARD_BYTES, robots),
     )
 
 

@@ -128,9 +128,7 @@ class Radio:
 
 
 class RadioLink:
-    """One program's link: a `Link`, whose cards are shown as in a mesh."""
-
-    sends_again = True
+    """One program's link: a `Link`."""
 
     def __init__(self, radio: Radio, station: int, subscriptions: Subscriptions) -> None:
         self.station = station

@@ -163,7 +163,6 @@ def up(
     until_s = time.monotonic() + timeout
     if of.robots is None:
         chosen = _in_slots(config, chosen)
-        _renew_group_key(config)
     arrivals = _arrivals(config, chosen, until_s)
     came = [outcome.robot for outcome in arrivals if outcome.value is not None]
     examinations = _examine(config, came)
@@ -199,14 +198,6 @@ def _print_remarks(config: "FleetConfig", trial_s: float) -> None:
     if config.insecure:
         typer.secho("insecure: whoever is on the network can fly this fleet", fg="yellow")
     typer.echo(f"trials: how many of {trial_s:g} s each pack lasts for; --trial SECONDS for others")
-
-
-def _renew_group_key(config: "FleetConfig") -> None:
-    """With all robots only: one that is not given the new key does not understand the others."""
-    from lpac.fleet.cards import has_group_keys, open_authority
-
-    if has_group_keys(config) and open_authority(config).renew_group_key():
-        typer.echo("the group has a new key, since a key of the fleet was revoked")
 
 
 def _arrivals(

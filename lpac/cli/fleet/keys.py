@@ -1,21 +1,20 @@
 """`lpac fleet init`, `operator`, `members`, `revoke` and `rotate`: who belongs to the fleet."""
 
 import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.fleet.progress import print_outcomes, require_all, run_for_each
+from lpac.cli.fleet.progress import print_outcomes, print_problems, require_all, run_for_each
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
-from lpac.cli.printing import BAD, GOOD, print_table, styled
+from lpac.cli.printing import GOOD, print_table, styled
 
 if TYPE_CHECKING:
     from rich.text import Text
 
+    from edge.identity.members import Member
     from lpac.analysis.snapshot import FleetSnapshot
-    from lpac.fleet.authority import Member
     from lpac.fleet.hold import Report
     from lpac.fleet.settings import FleetConfig, RobotHost
 
@@ -27,7 +26,7 @@ def init(
     ] = "",
 ) -> None:
     """Make the fleet's keys on this computer; the first `enroll` does it too."""
-    from lpac.fleet.cards import init as make_authority
+    from lpac.fleet.members import init as make_authority
     from lpac.fleet.settings import load_fleet
 
     authority = make_authority(load_fleet(fleet), name or user_at_host())
@@ -48,11 +47,12 @@ def operator(
 ) -> None:
     """Make another laptop a ground station of the fleet: the folder OUT, for it alone.
 
-    If NAME already has a card, its former key is revoked.
+    A key that NAME had before is taken off the list of members, which all robots that answer are
+    brought.
     """
-    from edge.identity.card import Role
+    from edge.identity.members import Role
     from lpac.fleet.authority import new_member
-    from lpac.fleet.cards import open_authority
+    from lpac.fleet.members import open_authority
     from lpac.fleet.settings import load_fleet
 
     if out.exists():
@@ -62,11 +62,12 @@ def operator(
     authority, snapshot = open_authority(config), _snapshot(config)
     if snapshot is not None and snapshot.commander == name:
         raise ValueError(
-            f"{name} commands the fleet, and a new card would revoke its key: let another ground "
-            "station command first (`lpac mission command`), or end it"
+            f"{name} commands the fleet, and would lose its key: let another ground station "
+            "command first (`lpac mission command`), or end it"
         )
     new_member(authority, out, role, name)
     typer.echo(f"{out}: {name} is an {role} of fleet {config.fleet}")
+    bring_list(config)
     typer.echo(
         f"move the folder to that laptop, by a way that nobody else can read, and name it there "
         f'in {fleet.name}: keys = "FOLDER"'
@@ -74,23 +75,21 @@ def operator(
 
 
 def members(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
-    """List the fleet's cards: whose they are, until when, and which were revoked."""
-    from lpac.fleet.cards import open_authority
+    """List the fleet's members."""
+    from lpac.fleet.members import open_authority
     from lpac.fleet.settings import load_fleet
 
-    known = open_authority(load_fleet(fleet)).members()
+    known = open_authority(load_fleet(fleet)).members
     if as_json:
-        typer.echo(json.dumps([_facts(member) for member in known]))
+        described = [_facts(member) for member in known.members]
+        typer.echo(json.dumps({"list": known.number, "members": described}))
         return
     rows: list[list[str | Text]] = [
-        [
-            member.name, member.role.value, "" if member.robot_id is None else str(member.robot_id),
-            time.strftime("%Y-%m-%d", time.gmtime(member.expires_unix_s)),
-            styled("revoked", BAD) if member.revoked else styled("good", GOOD),
-        ]
-        for member in known
-    ]  # fmt: skip
-    print_table(("name", "role", "robot id", "good until", "card"), rows, ("robot id",))
+        [member.name, member.role.value, "" if member.robot_id is None else str(member.robot_id)]
+        for member in known.members
+    ]
+    print_table(("name", "role", "robot id"), rows, ("robot id",))
+    typer.echo(f"list {known.number}")
 
 
 def _facts(member: "Member") -> dict[str, object]:
@@ -98,10 +97,21 @@ def _facts(member: "Member") -> dict[str, object]:
         "name": member.name,
         "role": member.role.value,
         "robot_id": member.robot_id,
-        "fingerprint": member.fingerprint,
-        "expires_unix_s": member.expires_unix_s,
-        "revoked": member.revoked,
+        "fingerprint": member.fingerprint.hex(),
     }
+
+
+def bring_list(config: "FleetConfig") -> None:
+    """Bring the list of members to all robots that answer, and print which do not."""
+    from lpac.fleet.members import bring_members_to
+
+    async def one(robot: "RobotHost", report: "Report") -> None:
+        await bring_members_to(config, robot, report)
+
+    outcomes = run_for_each(tuple(config.robots.values()), one)
+    if any(outcome.problem is not None for outcome in outcomes):
+        print_problems(outcomes)
+        typer.echo("these keep the list of members that they have until `lpac fleet up`")
 
 
 def revoke(
@@ -113,11 +123,10 @@ def revoke(
 ) -> None:
     """Let nobody listen to NAME any more: its drone or laptop was lost.
 
-    This laptop's `lpac ground` tells the robots, at once and for as long as it runs. Robots keep
-    away from where they heard a revoked one last.
+    It is taken off the list of members, which all robots that answer are brought, also in flight.
+    Robots keep away from where they heard one last that left.
     """
-    from edge.core.counted import counted
-    from lpac.fleet.cards import open_authority
+    from lpac.fleet.members import open_authority
     from lpac.fleet.settings import load_fleet
 
     config = load_fleet(fleet)
@@ -126,12 +135,9 @@ def revoke(
     why = _why_not_now(config, name)
     if why and not in_flight:
         raise ValueError(f"{why}: add --in-flight if that is what you want")
-    count = len(authority.revoke(name))
-    typer.echo(f"{name} is revoked ({counted(count, 'card')})")
-    typer.echo(
-        "robots know it 2 s after they hear this laptop's `lpac ground`: let it run while they "
-        "are on; one that never hears it goes on listening"
-    )
+    authority.revoke(name)
+    typer.echo(f"{name} is no member any more")
+    bring_list(config)
 
 
 def _why_not_now(config: "FleetConfig", name: str) -> str:
@@ -166,12 +172,12 @@ def _flying(snapshot: "FleetSnapshot") -> list[str]:
 def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
     """Renew everybody's keys: robots on the ground get new ones, and this computer.
 
-    The old keys are revoked. A robot in flight refuses, and keeps its own; so does this computer
-    while one flies that its `lpac ground` may command.
+    The old keys leave the list of members. A robot in flight refuses, and keeps its own; so does
+    this computer while one flies that its `lpac ground` may command.
     """
-    from edge.identity.card import Role
+    from edge.identity.members import Role
     from lpac.fleet.authority import new_member
-    from lpac.fleet.cards import open_authority, renew_card
+    from lpac.fleet.members import open_authority, renew_key
 
     config, chosen = open_fleet(fleet, robots)
     authority = open_authority(config)
@@ -184,7 +190,7 @@ def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
 
     async def one(robot: "RobotHost", report: "Report") -> None:
         report("new key", None)
-        await renew_card(config, robot, report)
+        await renew_key(config, robot, report)
 
     outcomes = run_for_each(chosen, one)
     print_outcomes(outcomes, lambda _: (styled("new key", GOOD),))
@@ -192,7 +198,9 @@ def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
     if own is not None and robots is None:
         new_member(authority, authority.folder, Role.OPERATOR, own)
         typer.echo(f"{own} has a new key: start `lpac ground` again")
-    others = {m.name for m in authority.members() if m.robot_id is None and not m.revoked} - {own}
+    authority.renew_group_key()
+    bring_list(config)
+    others = {m.name for m in authority.members.members if m.robot_id is None} - {own}
     for name in sorted(others):
         typer.echo(f"{name} keeps its key: `lpac fleet operator {name}` makes a new one")
     require_all(outcomes, "renewed on")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lpac.cli.fields import flag_of, options_of
+from lpac.cli.fleet.keys import bring_list
 from lpac.cli.fleet.progress import run_for_each, tell
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
 from lpac.cli.printing import GOOD, styled
@@ -54,9 +55,10 @@ class EnrolOptions:
 def enroll(of: EnrolOptions) -> None:
     """Make a computer with a vehicle a robot of the fleet; may be repeated at any time.
 
-    It gets a key, a place in the fleet's file as a spare, an id and a card; voxl-vision-hub is set,
-    programs that commanded the vehicle before are stopped; then come the release and PX4's
-    parameters. ssh asks for the password, if it is needed.
+    It gets a key, a place in the fleet's file as a spare, an id, and a line in the list of members,
+    which all robots that answer are brought; voxl-vision-hub is set, programs that commanded the
+    vehicle before are stopped; then come the release and PX4's parameters. ssh asks for the
+    password, if it is needed.
     """
     from lpac.fleet.settings import load_fleet
 
@@ -74,6 +76,9 @@ def enroll(of: EnrolOptions) -> None:
             typer.echo(f"{name}:")
         if steps := _enroll(name, of):
             left.append(f"{name} is not ready: left to do: {', '.join(steps)}")
+    config = load_fleet(of.fleet)
+    if config.keys is not None:
+        bring_list(config)
     if left:
         raise ValueError("; ".join(left))
     are = "is" if len(names) == 1 else "are"

@@ -1,8 +1,7 @@
-"""Keys and cards of a robot; each step may be repeated."""
+"""A robot's key and its list of members; each step may be repeated."""
 
 import base64
 import binascii
-import hashlib
 import os
 from typing import Any, Dict, Optional
 
@@ -10,17 +9,16 @@ from lpac.fleet.agent import Refused, call, must, require_disarmed, require_lock
 
 # As `edge.drivers.identity_folder` reads it; the program sees it below /var/lib/lpac.
 _MEMBERSHIP = "/var/lib/private/lpac/identity"
-_KEY, _NEXT_KEY, _CARD = "key.pem", "next-key.pem", "identity.json"
-_GROUP_KEYS = "group-keys"
+_KEY, _NEXT_KEY, _AUTHORITY, _MEMBERS = "key.pem", "next-key.pem", "authority.pem", "members"
 
 
 @call
 def identity_key(fresh: bool) -> Dict[str, Any]:
     """The public key of this robot, whose secret key is made here and never leaves.
 
-    With `fresh` it is another one than before, which counts once `set_card` brings its card.
-    Returns the `public_key` in hexadecimal digits, the text of the `card` that is there, and
-    the SHA-256 of the `group_keys` that are, in hexadecimal digits; None where there is none.
+    With `fresh` it is another one than before, which counts once `set_member` brings the rest.
+    Returns the `public_key` in hexadecimal digits, and the certificate of the `authority` that the
+    robot knows, in base64, None if none.
     """
     _make_identity()
     key = os.path.join(_MEMBERSHIP, _NEXT_KEY if fresh else _KEY)
@@ -30,44 +28,65 @@ def identity_key(fresh: bool) -> Dict[str, Any]:
         _own_identity()
     pem = must("openssl", "pkey", "-in", key, "-pubout")
     der = base64.b64decode("".join(pem.strip().split("\n")[1:-1]))
-    card, group_keys = _read(_CARD), _read(_GROUP_KEYS)
+    authority = _read(_AUTHORITY)
     # An Ed25519 key is the last 32 bytes of its DER (RFC 8410).
-    public_key = binascii.hexlify(der[-32:]).decode()
     return {
-        "public_key": public_key,
-        "card": card and card.decode(),
-        "group_keys": group_keys and hashlib.sha256(group_keys).hexdigest(),
+        "public_key": binascii.hexlify(der[-32:]).decode(),
+        "authority": authority and base64.b64encode(authority).decode(),
     }
 
 
 @call
-def set_card(files: Dict[str, str], fresh: bool, mavlink_port: int) -> Dict[str, Any]:
-    """Write what the fleet's authority gave for the key, `fresh` or not; by name, in base64.
+def set_member(files: Dict[str, str], fresh: bool, mavlink_port: int) -> Dict[str, Any]:
+    """Write what belongs to the key, `fresh` or not; by name, in base64.
 
     The robot's program reads it when it starts.
     """
     require_lock()
-    require_disarmed(mavlink_port, "a new card")
+    require_disarmed(mavlink_port, "a new key")
     _make_identity()
     if fresh:
         os.replace(os.path.join(_MEMBERSHIP, _NEXT_KEY), os.path.join(_MEMBERSHIP, _KEY))
-    for name, text in sorted(files.items()):
-        if os.path.basename(name) != name:
-            raise Refused("%r is no file's name" % name)
-        write_whole(os.path.join(_MEMBERSHIP, name), base64.b64decode(text), 0o600)
-    _own_identity()
+    _write_changed(files)
     return {}
 
 
 @call
-def set_group_keys(text: str, mavlink_port: int) -> Dict[str, Any]:
-    """Write the fleet's keys of its multicast group, in base64, which the program starts with."""
-    require_lock()
-    require_disarmed(mavlink_port, "a new key of the group")
-    _make_identity()
-    write_whole(os.path.join(_MEMBERSHIP, _GROUP_KEYS), base64.b64decode(text), 0o600)
+def set_members(files: Dict[str, str], number: int) -> Dict[str, Any]:
+    """Write the list of members, of this number, and the group's keys; by name, in base64.
+
+    The robot's program takes them up, also in flight. Returns whether one was `changed`.
+    """
+    has = _read(_MEMBERS)
+    if has is None:
+        raise Refused("it has no key of the fleet: run `lpac fleet enroll`")
+    known = _list_number(has)
+    if known > number or (known == number and has != base64.b64decode(files[_MEMBERS])):
+        raise Refused(
+            "its list of members is number %d, and this computer's %d is not newer: bring "
+            "`members` from the computer that changed it" % (known, number)
+        )
+    return {"changed": _write_changed(files)}
+
+
+def _list_number(members: bytes) -> int:
+    """The number in the list's first line; 0 of one that the program does not take up either."""
+    for line in members.decode("utf-8", "replace").split("\n"):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            return int(words[2]) if len(words) > 2 and words[2].isdigit() else 0
+    return 0
+
+
+def _write_changed(files: Dict[str, str]) -> bool:
+    """Write those that are not there already; whether there were any."""
+    changed = {name: data for name, data in files.items() if _read(name) != base64.b64decode(data)}
+    for name, text in sorted(changed.items()):
+        if os.path.basename(name) != name:
+            raise Refused("%r is no file's name" % name)
+        write_whole(os.path.join(_MEMBERSHIP, name), base64.b64decode(text), 0o600)
     _own_identity()
-    return {}
+    return bool(changed)
 
 
 def _read(name: str) -> Optional[bytes]:

@@ -171,10 +171,10 @@ class CommandTask:
         if not station.election.may_command and self.name != "hold":
             text = f"{station.operator} is an observer of this fleet: it may ask for hold alone"
             raise _ProblemError(ProblemCode.MAY_NOT, text)
-        if station.card_problem is not None and isinstance(self.request, (Takeoff, Start)):
+        if not station.is_member and isinstance(self.request, (Takeoff, Start)):
             text = (
-                f"the card of {station.operator} is {station.card_problem.value}: it needs a new "
-                "one (`lpac fleet rotate`, or `lpac fleet operator`)"
+                f"the key of {station.operator} is not in the list of members: it needs a new one "
+                "(`lpac fleet rotate`, or `lpac fleet operator`)"
             )
             raise _ProblemError(ProblemCode.MAY_NOT, text)
         own = station.commands or commander in ("", station.operator)

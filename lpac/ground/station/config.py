@@ -8,7 +8,7 @@ from pathlib import Path
 from edge.core.schema import ConfigError
 from edge.core.world import parse_world
 from edge.drivers.identity_folder import Identity, load_identity
-from edge.identity.card import Role
+from edge.identity.members import Role
 from edge.messages.mission import Place, world_id
 from edge.policy.bundle import load_bundle
 from lpac.analysis.snapshot import FleetSetup, FleetSlot
@@ -33,11 +33,11 @@ def load_ground(
 ) -> GroundConfig:
     """Load the ground station's configuration of the fleet. Raises ValueError or OSError.
 
-    In a fleet with keys its name is that of its card, and `operator` None or just that.
+    In a fleet with keys its name is the list's, and `operator` None or just that.
     """
     config = load_fleet(path)
     identity = load_own_identity(config, operator)
-    name = operator or default_name() if identity is None else identity.card.name
+    name = operator or default_name() if identity is None else identity.membership.own.name
     seated = next((slot.robot for slot in config.slots if slot.robot), None)
     if seated is None:
         raise ValueError(f"{path}: slots: no robot sits in one")
@@ -88,11 +88,12 @@ def load_own_identity(config: FleetConfig, operator: str | None) -> Identity | N
     if config.keys is None:
         return None
     identity = load_identity(config.keys, fleet=config.fleet, unix_s=time.time())
-    card = identity.card
-    if card.role is Role.ROBOT:
-        raise ConfigError(f"{config.keys}: is robot {card.name}'s, not a ground station's")
-    if operator not in (None, card.name):
+    own = identity.membership.own
+    if own.role is Role.ROBOT:
+        raise ConfigError(f"{config.keys}: is robot {own.name}'s, not a ground station's")
+    if operator not in (None, own.name):
         raise ConfigError(
-            f"--name {operator!r}: this station's card says {card.name!r}: leave --name out"
+            f"--name {operator!r}: the list of members calls this station {own.name!r}: leave "
+            "--name out"
         )
     return identity

@@ -8,8 +8,8 @@ import math
 import statistics
 from dataclasses import replace
 
-from edge.identity.card import Role
 from edge.identity.guard import Speaker
+from edge.identity.members import Role
 from edge.messages.mission import FlightState, GroundState, RobotStatus
 from lpac.analysis.commonest import commonest
 from lpac.analysis.snapshot import COMMANDER_SILENT_S, FleetSetup

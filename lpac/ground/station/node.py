@@ -13,8 +13,8 @@ from typing import Protocol
 
 from edge.core.memory import EXPLORED_CELLS
 from edge.core.ports import Clock
-from edge.identity.card import Role
 from edge.identity.guard import Guard, Speaker
+from edge.identity.members import Role
 from edge.messages.codec import MessageError, decode, encode
 from edge.messages.mission import GroundState, Hold, RobotStatus
 from edge.messages.topics import (
@@ -116,6 +116,11 @@ class GroundNode:
         """Time has passed; some five times a second."""
         self._set_time()
         self.station.hear_twice(self._guard.robots_said_twice())
+        self.station.members_problem = (
+            self._guard.members_differ()
+            if self.station.is_member
+            else "this station's key is not in the list of members: no robot hears it"
+        )
         for robot_id in self._guard.robots_ahead():
             name = self._names.get(f"robot/{robot_id}", "")
             self._complain(f"ahead {robot_id}", name, _AHEAD)
@@ -143,7 +148,7 @@ class GroundNode:
     def _set_time(self) -> None:
         unix_s = self._clock.unix_s()
         self.station.set_time(self._clock.monotonic_s(), unix_s)
-        self.station.card_problem = self._guard.card_problem(unix_s)
+        self.station.is_member = self._guard.is_listed()
         self._guard.hear_time(unix_s)
 
     def _receive(self, key: str, data: bytes, speaker: Speaker) -> None:
@@ -204,7 +209,6 @@ class GroundNode:
         self._published = self._to_publish()
         if self._link is None:
             return
-        self._guard.introduce()
         due = now_s - self._state_at_s > 1.0 / state_hz(len(station.setup.robots)) - _EARLY_S
         if due or self._published != before:
             state, hold = station.published_state(), station.published_hold

@@ -67,9 +67,9 @@ class GroundProcess:
         self._tell = tell
         clock, identity = SystemClock(), config.identity
         guard = None if identity is None else identity.guard(clock.monotonic_s)
-        self._exchange = (
+        self._take_up = (
             None if identity is None or guard is None
-            else partial(identity.keep, guard)
+            else partial(identity.take_up, guard)
         )  # fmt: skip
         self._node = GroundNode(
             config.setup, clock, self, guard or Unguarded(int(1e3 * clock.unix_s()))
@@ -130,9 +130,9 @@ class GroundProcess:
     async def _tick_on(self) -> None:
         next_s = time.monotonic()
         while True:
-            if self._exchange is not None:
+            if self._take_up is not None:
                 with self._writing():
-                    self._exchange()
+                    self._take_up()
             self._node.tick()
             with self._node.surviving("snapshot"):
                 if self._clients:

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Collection
 from dataclasses import replace
 
-from edge.identity.guard import CardProblem, Speaker
+from edge.identity.guard import Speaker
 from edge.messages.mission import (
     ON_GROUND,
     FlightState,
@@ -62,8 +62,9 @@ class Station:
     def __init__(
         self, setup: FleetSetup, now_s: float, unix_now_s: float, *, may_command: bool = True
     ) -> None:
-        # What is wrong with this station's own card; None: nothing.
-        self.card_problem: CardProblem | None = None
+        # Whether the list of members has this station's key, and what is wrong with the list.
+        self.is_member = True
+        self.members_problem = ""
         self._setup = setup
         self._robots = HeardRobots(setup.robots, now_s, unix_now_s, self.tell)
         self.orders = Orders(setup.operator, self._robots)
@@ -145,6 +146,7 @@ class Station:
             running=running,
             commander_age_s=self.election.commander_age_s,
             shares_name=self.election.shares_name,
+            members_problem=self.members_problem,
         )
 
     # Events

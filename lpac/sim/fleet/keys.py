@@ -3,8 +3,9 @@
 import shutil
 from pathlib import Path
 
-from edge.identity.card import Role
-from lpac.fleet.authority import create_authority, new_member
+from edge.drivers.identity_folder import MEMBERS
+from edge.identity.members import Role
+from lpac.fleet.authority import Authority, create_authority, new_member, write_file
 
 OPERATOR = "sim"
 
@@ -19,7 +20,14 @@ def write_keys(folder: Path, fleet: str, robots: int) -> Path:
     authority = create_authority(keys, fleet)
     new_member(authority, keys, Role.OPERATOR, OPERATOR)
     new_member(authority, listener, Role.OBSERVER, "listener")
-    for robot in range(robots):
-        identity = folder / "robots" / str(robot) / "identity"
+    identities = [folder / "robots" / str(robot) / "identity" for robot in range(robots)]
+    for robot, identity in enumerate(identities):
         new_member(authority, identity, Role.ROBOT, f"r{robot}", robot)
+    give_list(authority, listener, *identities)
     return listener
+
+
+def give_list(authority: Authority, *identities: Path) -> None:
+    """Write the list as it is now to the members' folders, as `lpac fleet up` does by SSH."""
+    for identity in identities:
+        write_file(identity / MEMBERS, authority.members.text.encode(), 0o600)

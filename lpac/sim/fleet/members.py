@@ -1,31 +1,23 @@
-"""The members of a simulated fleet: its authority, and whoever that gave a card."""
+"""The members of a simulated fleet: one list in memory, which all have."""
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 
-from edge.identity.card import Card, Revocations, Role, signed
 from edge.identity.guard import Membership, SignedGuard
+from edge.identity.members import Member, Members, Role
 from edge.identity.signature import Signer
-
-# No simulated card expires.
-_EXPIRES_UNIX_S = 1e11
 
 
 class SimulatedMembers:
-    """An authority in memory. Its keys follow from its name, so that flights can be repeated."""
+    """Keys follow from names, so that flights can be repeated; every guard has `list` at once."""
 
     def __init__(self, fleet: str) -> None:
         self._fleet = fleet
-        self.authority = self._signer("authority")
-        self._cards: dict[tuple[Role, str], bytes] = {}
-        self._revocations = 0
-
-    def join(self, role: Role, name: str, robot_id: int | None, start: int) -> Membership:
-        """One start of a member's program; its key and its card are the same each time."""
-        signer, serial = self._signer(f"{role} {name}"), len(self._cards) + 1
-        card = Card(self._fleet, role, name, signer.public_key, serial, _EXPIRES_UNIX_S, robot_id)
-        card_data = self._cards.setdefault((role, name), signed(card, self.authority))
-        return Membership(self.authority.public_key, signer, card_data, start)
+        self.list = Members(fleet, 1, self._signer("authority").public_key)
+        # All that ever did: whoever is revoked does not come back by starting again.
+        self._joined: list[Member] = []
+        self._guards: list[SignedGuard] = []
 
     def guard(
         self,
@@ -35,14 +27,25 @@ class SimulatedMembers:
         start: int,
         clock_s: Callable[[], float],
     ) -> SignedGuard:
-        """Guard that the member speaks and hears through."""
-        return SignedGuard(self.join(role, name, robot_id, start), clock_s)
+        """Guard of one start of a member's program, which joins if it is new; its key stays."""
+        signer = self._signer(f"{role} {name}")
+        own = Member(role, name, robot_id, signer.public_key)
+        if own not in self._joined:
+            self._joined.append(own)
+            self._change((*self.list.members, own))
+        guard = SignedGuard(Membership(own, signer, self.list, start), clock_s)
+        self._guards.append(guard)
+        return guard
 
-    def revoke(self, role: Role, name: str) -> bytes:
-        """A signed list with that member's key alone."""
-        self._revocations += 1
-        fingerprint = self._signer(f"{role} {name}").fingerprint.hex()
-        return signed(Revocations(self._revocations, (fingerprint,)), self.authority)
+    def revoke(self, role: Role, name: str) -> None:
+        """Take that member off the list."""
+        key = self._signer(f"{role} {name}").public_key
+        self._change(tuple(m for m in self.list.members if m.public_key != key))
+
+    def _change(self, members: tuple[Member, ...]) -> None:
+        self.list = replace(self.list, number=self.list.number + 1, members=members)
+        for guard in self._guards:
+            guard.take(self.list)
 
     def _signer(self, whose: str) -> Signer:
         return Signer(hashlib.sha256(f"{self._fleet} {whose}".encode()).digest())

@@ -16,8 +16,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Self, TypeVar
 
-from edge.identity.card import Role
 from edge.identity.guard import Guard, Unguarded
+from edge.identity.members import Role
 from edge.messages.mission import GroundState
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent
 from lpac.ground.procedure import NothingComesError, Procedure, Until, carry_out

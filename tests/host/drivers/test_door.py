@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 
 import pytest
 
-from edge.identity.card import Role
+from edge.identity.members import Role
 from lpac.fleet.authority import create_authority, new_member
 from tests.needs import needs
 
@@ -32,7 +32,7 @@ from pathlib import Path
 from edge.drivers.door import allow_most_descriptors
 from edge.drivers.identity_folder import load_identity
 from edge.drivers.zenoh_link import ZenohLink
-from edge.messages.topics import GROUND_CARD, STATUS
+from edge.messages.topics import HOLD, STATUS
 keys, *arguments = sys.argv[1:]
 identity = load_identity(Path(keys), fleet="demo", unix_s=time.time())
 guard = identity.guard(time.monotonic)
@@ -55,7 +55,7 @@ with ZenohLink(
     **settings,
 ) as link:
     while True:
-        link.publish(STATUS if robot_id else GROUND_CARD, b"here")
+        link.publish(STATUS if robot_id else HOLD, b"here")
         time.sleep(0.1)
 """
 _FLOOD = """

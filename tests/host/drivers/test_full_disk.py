@@ -13,7 +13,7 @@ import pytest
 
 from edge.drivers.flight_log import FlightLog, FlightMetadata, Missing, read
 from edge.drivers.identity_folder import load_identity
-from edge.identity.card import Role
+from edge.identity.members import Role
 from lpac.fleet.authority import create_authority, new_member
 from tests.needs import missing
 from tests.said import lines_said
@@ -150,11 +150,7 @@ def test_an_identity_has_room_kept_for_it(disk: Path, tmp_path: Path) -> None:
     fill(disk)
     identity = load_identity(folder, fleet="demo", unix_s=3e9)
     assert (folder / "start").read_text() == f"{identity.membership.start}\n" == "3000000000000\n"
-    authority.revoke("r3")
-    guard = identity.guard(lambda: 0.0)
-    guard.hear_revocations(authority.revocations)
-    identity.keep(guard)
-    assert load_identity(folder, fleet="demo", unix_s=4e9).revocations == authority.revocations
+    identity.take_up(identity.guard(lambda: 0.0))
 
 
 def test_an_identity_on_a_read_only_disk_starts_all_the_same(disk: Path, tmp_path: Path) -> None:
@@ -171,8 +167,8 @@ def test_an_identity_on_a_read_only_disk_starts_all_the_same(disk: Path, tmp_pat
         assert 2e12 < starts[0].membership.start < starts[1].membership.start
         guard = starts[1].guard(lambda: 0.0)
         with pytest.raises(OSError) as raised:
-            starts[1].keep(guard)
+            starts[1].take_up(guard)
         assert (raised.value.errno, raised.value.filename) == (errno.EROFS, str(folder / "start"))
-    starts[1].keep(guard)
+    starts[1].take_up(guard)
     later = load_identity(folder, fleet="demo", unix_s=5.0)
     assert later.membership.start == starts[1].membership.start + 1

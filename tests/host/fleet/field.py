@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from lpac.fleet.cards import give_card
 from lpac.fleet.hold import hold
+from lpac.fleet.members import join
 from lpac.fleet.release import Image, load_image
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
 from lpac.sim.fleet.keys import OPERATOR
@@ -78,11 +78,11 @@ def unwatched(_: str, __: float | None) -> None:
 
 
 def name_robot(hosts: FrailHosts, host: FrailHost) -> None:
-    """Give the host its identity and its card, as `enroll` does."""
+    """Give the host its identity and its key, as `enroll` does."""
     identity = {"fleet": hosts.fleet, "robot": host.name, "robot_id": host.robot_id}
     host.run(f"mkdir -p /etc/lpac; echo '{json.dumps(identity)}' > /etc/lpac/robot.json")
     config = load_fleet(hosts.fleet_toml)
-    asyncio.run(_give_card(config, config.robots[host.name]))
+    asyncio.run(_join(config, config.robots[host.name]))
 
 
 def give_image(host: FrailHost, image: Image, image_id: str | None = None) -> None:
@@ -116,9 +116,9 @@ def deploy_to(
     return robots
 
 
-async def _give_card(config: FleetConfig, robot: RobotHost) -> None:
+async def _join(config: FleetConfig, robot: RobotHost) -> None:
     async with hold(config, robot) as held:
-        await give_card(held.session, config, robot, lambda: OPERATOR)
+        await join(held.session, config, robot, lambda: OPERATOR)
 
 
 @contextmanager

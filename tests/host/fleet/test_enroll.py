@@ -232,7 +232,7 @@ def test_a_robot_is_not_renamed_nor_touched_in_flight_nor_let_in_unseen(
     assert done.returncode == 1
     assert outcomes(done.stdout)["robot id"] == "done"
     assert "it was r9 of fleet other (id 9)" in done.stdout
-    assert "the vehicle is armed: a new card is refused" in done.stderr
+    assert "the vehicle is armed: a new key is refused" in done.stderr
     hub = (new.root / "etc/modalai/voxl-vision-hub.conf").read_text()
     assert "figure_eight" in hub
     done = lpac_fleet(fleet_file, "enroll", "r4", "10.0.0.1")

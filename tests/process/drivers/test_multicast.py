@@ -16,13 +16,13 @@ from edge.drivers import multicast
 from edge.drivers.link import zenoh_link
 from edge.drivers.multicast import MulticastLink
 from edge.drivers.zenoh_link import ZenohLink
-from edge.identity.card import Card, Revocations, Role, signed
 from edge.identity.envelope import HEAD_BYTES, Address, enclose, seal
 from edge.identity.group import PART_BYTES, GroupKey, datagrams
 from edge.identity.guard import Membership, SignedGuard, Speaker, Unguarded
+from edge.identity.members import Member, Members, Role
 from edge.identity.news import MessageNumber
 from edge.identity.signature import Signer
-from edge.messages.topics import CARD, MESSAGE, STATUS, Group, Link, LinkSetting, Topic
+from edge.messages.topics import MESSAGE, STATUS, Group, GroupKeys, Link, LinkSetting
 from lpac.sim.ports import free_ports
 from tests.process.drivers.test_zenoh_link import Inbox, endpoint, eventually
 
@@ -33,14 +33,26 @@ AUTHORITY = Signer(b"a" * 32)
 @pytest.fixture
 def group() -> Group:
     (port,) = free_ports(1)
-    return Group("239.255.76.80", port, "127.0.0.1", (KEY, FORMER), is_secret=True)
+    return Group(
+        "239.255.76.80", port, "127.0.0.1", lambda: GroupKeys((KEY, FORMER), KEY), is_secret=True
+    )
 
 
-def signer_and_card(robot_id: int, enrolled: int = 1) -> tuple[Signer, Card]:
-    """A robot's, of the so many-th time that it was given any."""
-    signer = Signer(robot_id.to_bytes(16, "little") + enrolled.to_bytes(16, "little"))
-    name = f"r{robot_id}"
-    return signer, Card("test", Role.ROBOT, name, signer.public_key, enrolled, 2e9, robot_id)
+def signer_of(robot_id: int, enrolled: int = 1) -> Signer:
+    """A robot's, of the so many-th time that it was enrolled."""
+    return Signer(robot_id.to_bytes(16, "little") + enrolled.to_bytes(16, "little"))
+
+
+def members(enrolled: int = 1) -> Members:
+    """The list of the fleet's robots, when r1 was enrolled so many times."""
+    keys = {robot_id: signer_of(robot_id) for robot_id in range(1, 6)}
+    keys[1] = signer_of(1, enrolled)
+    return Members(
+        "test",
+        enrolled,
+        AUTHORITY.public_key,
+        tuple(Member(Role.ROBOT, f"r{i}", i, key.public_key) for i, key in keys.items()),
+    )
 
 
 class Robot:
@@ -59,9 +71,10 @@ class Robot:
         self.heard: dict[str, bytes] = {}
         self.all_heard: list[bytes] = []
         self.heard_at_s: list[float] = []
-        signer, card = signer_and_card(robot_id, enrolled)
-        membership = Membership(AUTHORITY.public_key, signer, signed(card, AUTHORITY), start)
-        self.guard = SignedGuard(membership, clock_s)
+        listed = members(enrolled)
+        self.own = next(m for m in listed.members if m.robot_id == robot_id)
+        signer = signer_of(robot_id, enrolled if robot_id == 1 else 1)
+        self.guard = SignedGuard(Membership(self.own, signer, listed, start), clock_s)
         self.radio = zenoh_link(
             LinkSetting(
                 "test", robot_id, (at or endpoint(),), (), False, {},
@@ -83,7 +96,7 @@ class Robot:
 
 
 def eventually_hear(sender: Robot, data: bytes, *receivers: Robot) -> None:
-    name = sender.guard.card.name
+    name = sender.own.name
 
     def heard() -> bool:
         sender.link.publish(MESSAGE, data)
@@ -134,31 +147,6 @@ def test_robots_hear_each_other_without_a_ground(group: Group) -> None:
         assert first.radio.peers() == 0
 
 
-def test_cards_are_shown_in_haste_since_nothing_lost_is_sent_again(group: Group) -> None:
-    now_s, messages, cards = 0.0, Inbox(), Inbox()
-    setting = LinkSetting(
-        "test", None, (endpoint(),), (), False, {},
-        {MESSAGE: messages, CARD: cards}, None, group,
-    )  # fmt: skip
-    with zenoh_link(setting), Robot(group, 1, clock_s=lambda: now_s) as robot:
-
-        def heard() -> bool:
-            robot.link.publish(MESSAGE, b"")
-            return messages.count > 0
-
-        eventually(heard)
-        # What was shown before anybody listened was lost.
-        before = cards.count
-
-        def shown(count: int) -> bool:
-            return cards.count == before + count
-
-        for count in (1, 2):
-            now_s = 0.5 * count
-            robot.link.publish(MESSAGE, b"")
-            eventually(partial(shown, count))
-
-
 def test_everything_else_goes_to_the_ground(group: Group) -> None:
     places, said = [endpoint(), endpoint()], Inbox()
     with (
@@ -166,14 +154,14 @@ def test_everything_else_goes_to_the_ground(group: Group) -> None:
         Robot(group, 2, places[1]) as second,
         ZenohLink(
             fleet="test", connect=places,
-            subscriptions=dict.fromkeys((MESSAGE, STATUS, CARD), said),
+            subscriptions=dict.fromkeys((MESSAGE, STATUS), said),
         ) as ground,
     ):  # fmt: skip
 
         def both() -> bool:
             first.link.publish(MESSAGE, b"to robots")
             first.link.publish(STATUS, b"to the ground")
-            return {"robot/1/status", "robot/1/card"} <= said.newest.keys() and "r1" in second.heard
+            return "robot/1/status" in said.newest and "r1" in second.heard
 
         eventually(both)
         eventually(lambda: ground.present() == {1, 2} and first.radio.peers() == 1)
@@ -290,10 +278,9 @@ def test_one_packet_with_a_stolen_key_mutes_no_robot_for_good(group: Group) -> N
         second.guard.hear_time(time.time())
 
         def stolen(start: int) -> bytes:
-            signer, _ = signer_and_card(1)
             said = seal(
                 b"stolen",
-                signer=signer,
+                signer=signer_of(1),
                 address=Address(AUTHORITY.public_key, "robot/1/message"),
                 number=MessageNumber(start, 2**32 - 1),
             )
@@ -317,18 +304,20 @@ def test_one_packet_with_a_stolen_key_mutes_no_robot_for_good(group: Group) -> N
 GREATEST = MessageNumber(2**48 - 1, 2**32 - 1)
 
 
-def shown_by_thief(card: bytes, signer: Signer, key: bytes) -> list[bytes]:
-    """As r1's card, in an envelope of the greatest number."""
-    address = Address(AUTHORITY.public_key, "robot/1/card")
-    message = seal(card, signer=signer, address=address, number=GREATEST)
-    return datagrams(message, topic=CARD, sender=1, key=GroupKey.of(key))
+def said_by_thief(signer: Signer, claimed: Signer, key: bytes) -> bytes:
+    """A message as r1's, under the greatest number, with `claimed` as its sender's key."""
+    address = Address(AUTHORITY.public_key, "robot/1/message")
+    message = seal(b"no word of r1", signer=signer, address=address, number=GREATEST)
+    message = message.replace(signer.fingerprint, claimed.fingerprint, 1)
+    (datagram,) = datagrams(message, topic=MESSAGE, sender=1, key=GroupKey.of(key))
+    return datagram
 
 
 @pytest.mark.parametrize("key", [KEY, FORMER], ids=["the present key", "the former key"])
-def test_no_forged_card_keeps_a_robots_own_from_being_heard(group: Group, key: bytes) -> None:
+def test_no_forged_message_keeps_a_robots_own_from_being_heard(group: Group, key: bytes) -> None:
     """Its number is the greatest; the robot has not been heard yet."""
     with Robot(group, 2) as second, stranger() as thief:
-        (datagram,) = shown_by_thief(b"no card", Signer(b"t" * 32), key)
+        datagram = said_by_thief(Signer(b"t" * 32), signer_of(1), key)
 
         def refused() -> bool:
             thief.sendto(datagram, (group.address, group.port))
@@ -339,17 +328,15 @@ def test_no_forged_card_keeps_a_robots_own_from_being_heard(group: Group, key: b
             eventually_hear(first, b"here", second)
 
 
-def test_a_stolen_robots_card_does_not_keep_the_new_one_from_being_heard(group: Group) -> None:
-    """It was revoked, and the robot enrolled anew; the thief has the former key."""
-    signer, card = signer_and_card(1)
-    revoked = signed(Revocations(1, (card.fingerprint.hex(),)), AUTHORITY)
+def test_a_stolen_robots_key_does_not_keep_the_new_one_from_being_heard(group: Group) -> None:
+    """The robot was enrolled anew; the thief has its former key, and the group's."""
     with Robot(group, 2) as second, stranger() as thief:
-        assert second.guard.hear_revocations(revoked)
-        (datagram,) = shown_by_thief(signed(card, AUTHORITY), signer, FORMER)
+        second.guard.take(members(enrolled=2))
+        datagram = said_by_thief(signer_of(1), signer_of(1), FORMER)
 
         def refused() -> bool:
             thief.sendto(datagram, (group.address, group.port))
-            return "revoked" in second.guard.refused()
+            return "unknown_key" in second.guard.refused()
 
         eventually(refused)
         with Robot(group, 1, enrolled=2) as first:
@@ -378,17 +365,16 @@ def flooding(group: Group, said: list[bytes], rate_hz: float) -> Iterator[None]:
             thread.join()
 
 
-@pytest.mark.parametrize("topic", [MESSAGE, CARD], ids=["messages", "cards"])
 @pytest.mark.parametrize("names", [[1], range(1000, 3000)], ids=["its name", "many names"])
 def test_whoever_has_the_former_key_alone_drowns_out_no_robot_that_begins(
-    group: Group, topic: Topic, names: Sequence[int]
+    group: Group, names: Sequence[int]
 ) -> None:
     said = [
         datagram
         for number, name in enumerate(itertools.islice(itertools.cycle(names), 2000))
         for datagram in datagrams(
             enclose(b"x" * 100, MessageNumber(2**40, number)),
-            topic=topic, sender=name, key=GroupKey.of(FORMER),
+            topic=MESSAGE, sender=name, key=GroupKey.of(FORMER),
         )
     ]  # fmt: skip
     with Robot(group, 2) as second, flooding(group, said, 800.0):
@@ -400,11 +386,32 @@ def test_whoever_has_the_former_key_alone_drowns_out_no_robot_that_begins(
 
 
 def test_who_has_the_former_key_is_heard_and_hears_nothing_new(group: Group) -> None:
-    late = group._replace(keys=(FORMER,))
+    late = group._replace(keys=lambda: GroupKeys((FORMER,), FORMER))
     with Robot(group, 1) as first, Robot(group, 2) as second, Robot(late, 3) as third:
         eventually_hear(third, b"still here", first, second)
         eventually_hear(first, b"with the new key", second)
         assert not third.heard and third.radio.refused() > 0
+
+
+def test_a_new_key_is_taken_up_while_the_group_is_spoken_in(group: Group) -> None:
+    """Whoever is in the air goes on with the former one, and hears those that have the new one."""
+    keys = {1: GroupKeys((FORMER,), FORMER), 2: GroupKeys((FORMER,), FORMER)}
+    groups = {robot: group._replace(keys=partial(keys.__getitem__, robot)) for robot in keys}
+    with Robot(groups[1], 1) as first, Robot(groups[2], 2) as second:
+        eventually_hear(first, b"both with the former", second)
+        keys[1] = GroupKeys((KEY, FORMER), FORMER)
+        eventually_hear(first, b"in the air", second)
+        keys[2] = GroupKeys((KEY, FORMER), KEY)
+        eventually_hear(second, b"on the ground", first)
+        eventually_hear(first, b"still in the air", second)
+        keys[1] = GroupKeys((KEY, FORMER), KEY)
+        eventually_hear(first, b"landed", second)
+        with stranger() as thief:
+            said = said_by_thief(signer_of(1), signer_of(1), FORMER)
+            refused = second.guard.refused()
+            thief.sendto(said, (group.address, group.port))
+        eventually_hear(first, b"and on", second)
+        assert second.guard.refused() == refused
 
 
 def test_what_many_say_is_heard_as_well_when_it_is_taken_together(

@@ -38,7 +38,6 @@ class _ThinLink:
         self._link, self._fleet, self._robot_id = link, fleet, robot_id
         self._count = 0
         self.is_claimed, self.peers, self.refused = link.is_claimed, link.peers, link.refused
-        self.sends_again = link.sends_again
         self.close = link.close
 
     def publish(self, topic: Topic, data: bytes) -> None:

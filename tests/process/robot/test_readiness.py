@@ -13,7 +13,6 @@ import pytest
 from edge.core.fence import Fence
 from edge.core.position import PositionJudgement
 from edge.drivers.px4.autopilot import MavsdkAutopilot
-from edge.identity.guard import CardProblem
 from edge.messages.codes import CheckCode
 from edge.messages.mission import GroundState, Origin
 from edge.robot.config import load_config
@@ -59,7 +58,8 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
         "fell_silent": (),
         "duplicate": False,
         "watchdog_alive": True,
-        "card_problem": None,
+        "is_listed": True,
+        "members_differ": "",
         "ground_age_s": 0.1,
         "time_uncertainty_s": 0.01,
         "answer_age_s": 0.3,
@@ -205,7 +205,8 @@ def test_a_look_that_fails_before_arming_ends_no_watch(
     [
         ({"watchdog_alive": False}, CheckCode.WATCHDOG_ENDED),
         ({"duplicate": True}, CheckCode.DUPLICATE_ID),
-        ({"card_problem": CardProblem.REVOKED}, CheckCode.CARD_NOT_GOOD),
+        ({"is_listed": False}, CheckCode.NOT_A_MEMBER),
+        ({"members_differ": "r2 has list 8"}, CheckCode.MEMBERS_DIFFER),
         ({"ground_age_s": float("inf")}, CheckCode.GROUND_NOT_HEARD),
         ({"ground_age_s": 9.0}, CheckCode.GROUND_SILENT),
         ({"time_uncertainty_s": None}, CheckCode.TIME_NOT_KNOWN),

@@ -20,14 +20,16 @@ import zenoh
 
 from edge.drivers.identity_folder import Identity, load_identity
 from edge.drivers.zenoh_link import ZenohLink
-from edge.identity.card import Role
 from edge.identity.guard import SignedGuard
+from edge.identity.members import Role
 from edge.messages.codec import encode
+from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, GroundState, Order, RobotStatus
 from edge.messages.topics import HOLD, ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
 from lpac.fleet.authority import Authority, create_authority, new_member
 from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
+from lpac.sim.fleet.keys import give_list
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.scenario import Scenario
@@ -334,8 +336,12 @@ def thief(rig: FleetRig) -> Iterator[Callable[[int], None]]:
 def test_a_flood_of_a_laptop_drowns_no_command(
     rig: FleetRig, tmp_path: Path, role: Role, topic: Topic
 ) -> None:
-    """Of an observer's, and of one that was an operator's and is revoked."""
-    new_member(Authority(rig.fleet.folder / "keys", rig.fleet.name), tmp_path, role, "eve")
+    """Of an observer's, and of one that was an operator's and is no member any more.
+
+    The robots do not know it: as if it had been taken off their list.
+    """
+    authority = Authority(rig.fleet.folder / "keys", rig.fleet.name)
+    new_member(authority, tmp_path, role, "eve")
     eve = load_identity(tmp_path, fleet=rig.fleet.name, unix_s=1.0)
     over = threading.Event()
     with session(rig.fleet, certified(eve.tls)) as opened:
@@ -370,6 +376,10 @@ def test_the_operator_goes_on_commanding(rig: FleetRig) -> None:
         rig.wait_state(robot, _S.HOLD)
 
 
+def codes(status: RobotStatus) -> set[ReasonCode]:
+    return {alarm.code for alarm in status.alarms}
+
+
 def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FleetRig) -> None:
     rig.command(Resume())
     rig.start()
@@ -377,15 +387,23 @@ def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FleetRig
     for command, why in (
         (("revoke", stolen), f"{stolen} was heard in the air last: add --in-flight"),
         (("revoke", "sim"), "sim commands the fleet: add --in-flight"),
-        (("operator", "sim", "--out", rig.fleet.folder / "new"), "a new card would revoke its key"),
+        (("operator", "sim", "--out", rig.fleet.folder / "new"), "and would lose its key"),
         (("rotate",), "r0, r1 flew when last heard, and would lose this computer's ground"),
     ):
         assert why in error_line(lpac("fleet", *command, *fleet))
     assert flies_on(rig.status(0)) and flies_on(rig.status(STOLEN))
     done = lpac("fleet", "revoke", stolen, "--in-flight", *fleet)
     assert done.returncode == 0, done.stderr
+    assert "these keep the list of members that they have" in done.stdout
+    # SSH reaches the other one alone.
+    give_list(
+        Authority(rig.fleet.folder / "keys", rig.fleet.name),
+        rig.fleet.robots[0].folder / "identity",
+    )
     rig.wait_status(0, lambda status: not status.neighbour_ages_s)
     assert flies_on(rig.status(0))
+    # Whoever kept the old list says so, and flies on.
+    rig.wait_status(STOLEN, lambda status: ReasonCode.MEMBERS_DIFFER in codes(status))
     assert rig.ground.told.wait_for(
         lambda told: {robot.name for robot in told.robots if robot.fresh} == {"r0"}, 60.0
     )

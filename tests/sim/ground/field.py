@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from edge.identity.card import Role
+from edge.identity.members import Role
 from edge.messages.mission import FlightState
 from lpac.analysis.snapshot import GroundEvent
 from lpac.ground.station.commands import Commands, CommandTask

@@ -17,15 +17,14 @@ from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
 from edge.core.wire import Rejection, decode, encode
 from edge.drivers.registry import load_policy
-from edge.identity.card import Role
 from edge.identity.guard import Speaker
+from edge.identity.members import Role
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon
 from edge.messages.mission import FlightState, RobotStatus
-from edge.messages.topics import MESSAGE, REVOKED
+from edge.messages.topics import MESSAGE
 from lpac.analysis.flight import least_separation
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.station.protocol import Enable, Request, SetOrigin, Start, Takeoff
-from lpac.sim.air import GROUND
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.scenario import Scenario
@@ -181,9 +180,7 @@ def held_up(ready: SimulatedFleet, hovering: SimulatedFleet, seed: int) -> HeldU
         _pass(fleet, 2.0)
         counts.append(_kept_from(fleet, request, state))
         assert fleet.members is not None
-        fleet.radio.link(GROUND - 1, {}).publish(
-            REVOKED, fleet.members.revoke(Role.ROBOT, thief.name)
-        )
+        fleet.members.revoke(Role.ROBOT, thief.name)
         # What it said last is forgotten.
         _pass(fleet, 5.0)
         counts.append(_kept_from(fleet, request, state))

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 
-from edge.identity.guard import CardProblem
 from edge.messages.mission import FlightState, Place, world_id
 from lpac.ground.station.protocol import (
     Enable,
@@ -44,16 +43,16 @@ def two_stations(n: int = 2, stage: Stage = "ready") -> Field:
 
 
 @pytest.mark.parametrize("request_", [TAKEOFF, Start()])
-def test_who_has_no_good_card_sets_nobody_in_motion(
+def test_who_is_no_member_sets_nobody_in_motion(
     monkeypatch: pytest.MonkeyPatch, request_: Request
 ) -> None:
     field = a_field(1, "ready")
     guard = field.fleet.grounds["alice"].node._guard
-    monkeypatch.setattr(type(guard), "card_problem", lambda *_: CardProblem.EXPIRED)
+    monkeypatch.setattr(type(guard), "is_listed", lambda *_: False)
     report = field.do(request_)
     assert problem(report) is ProblemCode.MAY_NOT
     assert report.problem is not None
-    assert report.problem.text.startswith("the card of alice is expired: it needs a new one")
+    assert report.problem.text.startswith("the key of alice is not in the list of members: ")
 
 
 # A hold keeps robots on the ground, too

@@ -1,7 +1,6 @@
 """What a ground says to more robots than a radio has time for, each by itself."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import pytest
 
@@ -21,7 +20,6 @@ TICK_S = 0.2
 class Ground:
     """Its clock, its link and who is told, for one that is alone."""
 
-    sends_again: ClassVar[bool] = True
     now_s: float = 0.0
     said: list[tuple[float, GroundState]] = field(default_factory=list)
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.identity.card import Role
 from edge.identity.guard import Speaker, Unguarded
+from edge.identity.members import Role
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Place, world_id
 from lpac.ground.alarms import AlarmCode, alarms

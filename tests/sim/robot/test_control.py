@@ -31,8 +31,8 @@ from edge.core.world import random_features, rasterize
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
 from edge.flight.state import FlightInputs
-from edge.identity.card import Role
 from edge.identity.guard import Speaker
+from edge.identity.members import Role
 from edge.messages.beacon import Beacon, Neighbour
 from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, RefusalCode

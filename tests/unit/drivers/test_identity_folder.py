@@ -1,4 +1,4 @@
-"""Keys, cards and certificates as they lie on the disk."""
+"""Keys, certificates and the list of members as they lie on the disk."""
 
 import stat
 from pathlib import Path
@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from edge.core.schema import ConfigError
-from edge.drivers.identity_folder import GROUP_KEYS, load_identity
-from edge.identity.card import Revocations, Role, verified
+from edge.drivers.identity_folder import GROUP_KEYS, MEMBERS, load_identity
+from edge.identity.members import Role
 from lpac.fleet.authority import (
     Authority,
     AuthorityError,
@@ -15,6 +15,7 @@ from lpac.fleet.authority import (
     new_member,
     write_file,
 )
+from lpac.sim.fleet.keys import give_list
 
 
 @pytest.fixture
@@ -24,26 +25,78 @@ def authority(tmp_path: Path) -> Authority:
 
 def test_a_member_is_who_the_authority_says(authority: Authority, tmp_path: Path) -> None:
     folder = tmp_path / "r3"
-    issued = new_member(authority, folder, Role.ROBOT, "r3", 3)
-    identity = load_identity(folder, fleet="demo", unix_s=2e9)
-    assert (identity.card.role, identity.card.robot_id) == (Role.ROBOT, 3)
-    assert identity.card.public_key == issued.public_key
-    assert identity.membership.authority == authority.public_key
+    member = new_member(authority, folder, Role.ROBOT, "r3", 3)
+    identity = load_identity(folder, fleet="demo", unix_s=2e9, robot_id=3)
+    assert identity.membership.own == member
+    assert identity.membership.members == authority.members
     # A clock that was lost does not make it an earlier start than the last one.
     assert identity.membership.start == 2_000_000_000_000
     assert load_identity(folder, fleet="demo", unix_s=5.0).membership.start == 2_000_000_000_001
     assert load_identity(folder, fleet="demo", unix_s=3e9).membership.start == 3_000_000_000_000
-    # What was heard in flight is known the next time.
+    with pytest.raises(ConfigError, match="is robot r3's, not robot 4's"):
+        load_identity(folder, fleet="demo", unix_s=2e9, robot_id=4)
+    # One that left starts as the robot that it is, as it may be in the air; nobody else does.
+    authority.revoke("r3")
+    give_list(authority, folder)
+    identity = load_identity(folder, fleet="demo", unix_s=2e9, robot_id=3)
+    assert not identity.guard(lambda: 0.0).is_listed()
+    with pytest.raises(ConfigError, match="its key is not in the list of members"):
+        load_identity(folder, fleet="demo", unix_s=2e9)
+
+
+def test_a_running_program_takes_up_the_list_that_it_is_brought(
+    authority: Authority, tmp_path: Path
+) -> None:
+    folder = tmp_path / "r3"
+    new_member(authority, folder, Role.ROBOT, "r3", 3)
+    identity = load_identity(folder, fleet="demo", unix_s=2e9)
     guard = identity.guard(lambda: 0.0)
-    authority.revoke("r3")
-    assert guard.hear_revocations(authority.revocations)
-    identity.keep(guard)
-    assert load_identity(folder, fleet="demo", unix_s=3e9).revocations == authority.revocations
-    # And what comes onto the disk meanwhile, in flight.
-    authority.revoke("r3")
-    (folder / "revoked").write_bytes(authority.revocations)
-    identity.keep(guard)
-    assert guard.revocations == authority.revocations
+    new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
+    give_list(authority, folder)
+    identity.take_up(guard)
+    assert guard.members == authority.members
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (b"", "does not begin with"),
+        (b"fleet demo 9 2 " + 64 * b"a" + b"\n", "has 0 of 2 members"),
+        (b"fleet demo 1 0 %b\n", "list 1 is not newer than 2"),
+        (b"fleet demo 9 0 " + 64 * b"a" + b"\n", "is another fleet's"),
+        (b"fleet other 9 0 %b\n", "is another fleet's"),
+        (None, "No such file"),
+    ],
+    ids=["empty", "torn", "older", "another authority's", "another fleet's", "missing"],
+)
+def test_a_list_that_cannot_be_used_changes_nothing_and_is_told_once(
+    authority: Authority,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    text: bytes | None,
+    why: str,
+) -> None:
+    folder = tmp_path / "r3"
+    new_member(authority, folder, Role.ROBOT, "r3", 3)
+    identity = load_identity(folder, fleet="demo", unix_s=2e9)
+    guard, good = identity.guard(lambda: 0.0), (folder / MEMBERS).read_bytes()
+    identity.take_up(guard)
+    if text is None:
+        (folder / MEMBERS).unlink()
+    else:
+        (folder / MEMBERS).write_bytes(text.replace(b"%b", good.split()[4]))
+    capsys.readouterr()
+    for _ in range(3):
+        identity.take_up(guard)
+    assert guard.members == authority.members
+    told = capsys.readouterr()
+    assert (told.out + told.err).count("list of members not taken up") == 1
+    assert why in told.out + told.err
+    # And is followed again, once it is whole.
+    new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
+    give_list(authority, folder)
+    identity.take_up(guard)
+    assert guard.members == authority.members
 
 
 def test_a_start_that_was_numbered_anew_stays_so_while_the_program_runs(
@@ -54,7 +107,7 @@ def test_a_start_that_was_numbered_anew_stays_so_while_the_program_runs(
     new_member(authority, folder, Role.ROBOT, "r3", 3)
     identity = load_identity(folder, fleet="demo", unix_s=3e9)
     (folder / "start").write_text("2000000000000\n")
-    identity.keep(identity.guard(lambda: 0.0))
+    identity.take_up(identity.guard(lambda: 0.0))
     again = load_identity(folder, fleet="demo", unix_s=2.000000001e9)
     assert again.membership.start == 2_000_000_001_000
 
@@ -69,44 +122,73 @@ def test_a_start_that_could_not_be_written_is_written_later_once(
     identity = load_identity(folder, fleet="demo", unix_s=2e9)
     guard = identity.guard(lambda: 0.0)
     with pytest.raises(OSError, match="start"):
-        identity.keep(guard)
+        identity.take_up(guard)
     obstacle.rmdir()
     for text in ("2000000000000\n", "1000\n"):
-        identity.keep(guard)
+        identity.take_up(guard)
         assert start.read_text() == text
         start.write_text("1000\n")
 
 
-def test_robots_share_a_key_that_is_renewed_when_one_is_a_member_no_more(
+def test_robots_share_a_key_of_the_group_that_changes_when_one_leaves(
     authority: Authority, tmp_path: Path
 ) -> None:
-    def keys(robot_id: int) -> tuple[bytes, ...]:
-        folder = tmp_path / f"r{robot_id}"
-        write_file(folder / GROUP_KEYS, authority.group_keys(), 0o600)
-        return load_identity(folder, fleet="demo", unix_s=2e9).group_keys
+    def given() -> tuple[bytes, ...]:
+        write_file(
+            tmp_path / "r1" / GROUP_KEYS, (authority.folder / GROUP_KEYS).read_bytes(), 0o600
+        )
+        give_list(authority, tmp_path / "r1")
+        keys = load_identity(tmp_path / "r1", fleet="demo", unix_s=2e9).group_keys
+        assert keys is not None and keys.spoken == keys.heard[0]
+        return keys.heard
 
     for robot_id in (1, 2):
         new_member(authority, tmp_path / f"r{robot_id}", Role.ROBOT, f"r{robot_id}", robot_id)
     # The ground is not in the group.
     new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
     assert not (tmp_path / "ann" / GROUP_KEYS).exists()
-    (first,) = keys(1)
-    assert keys(2) == (first,) and len(first) == 32
-    assert not authority.renew_group_key()
+    authority.revoke("ann")
+    (first,) = given()
+    assert len(first) == 32
+    assert (tmp_path / "r2" / GROUP_KEYS).read_bytes() == (
+        tmp_path / "r1" / GROUP_KEYS
+    ).read_bytes()
     authority.revoke("r2")
-    # Not before all robots are given it.
-    assert keys(1) == (first,)
-    assert authority.renew_group_key() and not authority.renew_group_key()
-    second, former = keys(1)
+    second, former = given()
     assert former == first != second
-    authority.revoke("r2")
-    assert authority.renew_group_key()
-    assert keys(1)[1:] == (second,)
+    # Also if another computer takes its place; but a new robot changes nothing.
+    new_member(authority, tmp_path / "r3", Role.ROBOT, "r3", 3)
+    assert given() == (second, first)
+    new_member(authority, tmp_path / "r3", Role.ROBOT, "r3", 3)
+    assert given()[1:] == (second,)
+
+
+def test_in_flight_the_groups_key_that_is_spoken_stays(
+    authority: Authority, tmp_path: Path
+) -> None:
+    """Others in the air may have been given none; all who have one are heard meanwhile."""
+    folder = tmp_path / "r1"
+    for robot_id in (1, 2, 3):
+        new_member(authority, tmp_path / f"r{robot_id}", Role.ROBOT, f"r{robot_id}", robot_id)
+    identity = load_identity(folder, fleet="demo", unix_s=2e9)
+    guard = identity.guard(lambda: 0.0)
+    assert identity.group_keys is not None
+    first = identity.group_keys.spoken
+    for leaves in ("r2", "r3"):
+        authority.revoke(leaves)
+        write_file(folder / GROUP_KEYS, (authority.folder / GROUP_KEYS).read_bytes(), 0o600)
+        give_list(authority, folder)
+        identity.take_up(guard, in_flight=True)
+        assert identity.group_keys.spoken == first == identity.group_keys.heard[-1]
+    assert len(identity.group_keys.heard) == 3
+    identity.take_up(guard)
+    assert len(identity.group_keys.heard) == 2 and first not in identity.group_keys.heard
+    assert identity.group_keys.spoken == identity.group_keys.heard[0]
 
 
 def test_secrets_are_for_nobody_else(authority: Authority, tmp_path: Path) -> None:
     new_member(authority, authority.folder, Role.OPERATOR, "ann")
-    secrets = ("authority.key", "members.json", "key.pem")
+    secrets = ("authority.key", "group-keys", "key.pem")
     for name in secrets:
         assert stat.S_IMODE((authority.folder / name).stat().st_mode) == 0o600
     (authority.folder / "key.pem").chmod(0o644)
@@ -120,12 +202,11 @@ def test_secrets_are_for_nobody_else(authority: Authority, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("name", "data", "problem"),
     [
-        ("identity.json", None, r"identity\.json is missing: enroll it first"),
-        ("identity.json", b"[" * 100_000, r"identity\.json: "),
-        ("identity.json", b'{"fleet":"demo","authority":"xy","card":""}', "hexadecimal"),
+        ("members", None, r"members is missing: enroll it first"),
+        ("members", b"[" * 100_000, r"members: does not begin with"),
+        ("group-keys", b"xy", "hexadecimal"),
         ("key.pem", None, r"key\.pem is missing"),
         ("key.pem", b"-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----", "no Ed25519"),
-        ("revoked", b"nonsense", "Revocations: this fleet's authority has not signed it"),
     ],
 )
 def test_what_cannot_be_used_is_one_line(
@@ -146,28 +227,32 @@ def test_another_fleets_identity_is_refused(authority: Authority, tmp_path: Path
     new_member(authority, authority.folder, Role.OPERATOR, "ann")
     with pytest.raises(ConfigError, match="is of fleet 'demo', not of 'field'"):
         load_identity(authority.folder, fleet="field", unix_s=2e9)
-    # The card of one key beside the key of another.
+    # A key that the list does not have.
     new_member(authority, tmp_path / "bob", Role.OPERATOR, "bob")
+    authority.revoke("bob")
     (authority.folder / "key.pem").write_bytes((tmp_path / "bob" / "key.pem").read_bytes())
-    with pytest.raises(ConfigError, match="the card of ann is for another key"):
+    with pytest.raises(ConfigError, match="its key is not in the list of members"):
         load_identity(authority.folder, fleet="demo", unix_s=2e9)
 
 
 def test_a_member_that_gets_a_new_key_loses_the_old_one(
     authority: Authority, tmp_path: Path
 ) -> None:
-    old = new_member(authority, tmp_path / "old", Role.ROBOT, "r3", 3)
-    new_member(authority, tmp_path / "r4", Role.ROBOT, "r4", 4)
+    def known() -> list[tuple[str, bytes]]:
+        return [(m.name, m.public_key) for m in authority.members.members]
+
+    new_member(authority, tmp_path / "old", Role.ROBOT, "r3", 3)
+    r4 = new_member(authority, tmp_path / "r4", Role.ROBOT, "r4", 4)
+    number = authority.members.number
     new = new_member(authority, tmp_path / "new", Role.ROBOT, "spare", 3)
-    assert new.serial > old.serial
-    revocations = verified(Revocations, authority.revocations, authority.public_key)
-    assert revocations.fingerprints == (old.fingerprint,)
-    assert [(m.name, m.revoked) for m in authority.members()] == [
-        ("r3", True), ("r4", False), ("spare", False),
-    ]  # fmt: skip
+    assert known() == [("r4", r4.public_key), ("spare", new.public_key)]
+    # What is so already changes nothing; a computer that becomes another robot is that one alone.
+    authority.issue(Role.ROBOT, "spare", new.public_key, 3)
+    assert authority.members.number == number + 1
+    authority.issue(Role.ROBOT, "r4", new.public_key, 4)
+    assert known() == [("r4", new.public_key)] and authority.members.number == number + 2
     authority.revoke("r4")
-    later = verified(Revocations, authority.revocations, authority.public_key)
-    assert later.count > revocations.count and len(later.fingerprints) == 2
+    assert known() == []
 
 
 def test_an_authority_says_what_it_cannot_do(authority: Authority, tmp_path: Path) -> None:
@@ -183,15 +268,9 @@ def test_an_authority_says_what_it_cannot_do(authority: Authority, tmp_path: Pat
         authority.revoke("bob")
 
 
-def test_an_authority_revokes_as_many_as_a_list_holds(
-    authority: Authority, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("lpac.fleet.authority.MOST_REVOKED", 1)
-    for name in ("ann", "bob"):
-        new_member(authority, tmp_path / name, Role.OPERATOR, name)
-    # Another's name, in another role, is another member.
-    new_member(authority, tmp_path / "watcher", Role.OBSERVER, "bob")
-    authority.revoke("ann")
-    with pytest.raises(AuthorityError, match="3 keys are revoked, and a list holds 1"):
-        authority.revoke("bob")
-    assert [member.revoked for member in authority.members()] == [True, False, False]
+def test_a_name_in_another_role_is_another_member(authority: Authority, tmp_path: Path) -> None:
+    for name, role in (("a", Role.OPERATOR), ("b", Role.OBSERVER)):
+        new_member(authority, tmp_path / name, role, "bob")
+    assert [m.role for m in authority.named("bob")] == [Role.OPERATOR, Role.OBSERVER]
+    with pytest.raises(ValueError, match="must be 1 to 128 letters, none of them a space"):
+        new_member(authority, tmp_path / "c", Role.OPERATOR, "two words")

@@ -136,8 +136,7 @@ R1 = CONFIG.robots["r1"]
 PORT = R1.mavlink_port
 NEEDS_LOCK: tuple[Callable[[str], object], ...] = (
     lambda folder: agent.switch(folder, "1", PORT),
-    lambda folder: enrolment.set_card({}, False, PORT),
-    lambda folder: enrolment.set_group_keys("", PORT),
+    lambda folder: enrolment.set_member({}, False, PORT),
 )
 
 

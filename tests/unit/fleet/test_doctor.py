@@ -12,10 +12,9 @@ import pytest
 
 from edge.core.vehicle import Gps
 from edge.flight.margins import ErrorBudget
-from edge.identity.card import Role
+from edge.identity.members import Role
 from edge.messages.codes import CheckCode, FailedCheck
 from lpac.fleet import laptop
-from lpac.fleet.cards import init, open_authority
 from lpac.fleet.doctor import (
     ClockOffset,
     Diagnosis,
@@ -29,6 +28,7 @@ from lpac.fleet.doctor import (
     on,
 )
 from lpac.fleet.laptop import rsync_version
+from lpac.fleet.members import init, open_authority
 from lpac.fleet.operations import Outcome
 from lpac.fleet.settings import FleetConfig, RadioConfig, RobotHost, SshConfig, load_fleet
 from lpac.fleet.up import decide, packs
@@ -54,13 +54,14 @@ def config(tmp_path: Path) -> FleetConfig:
     return config
 
 
-def card_of(config: FleetConfig, robot: RobotHost) -> str | None:
+def members_of(config: FleetConfig) -> str | None:
+    """The list of members, with all robots of the file."""
     if config.keys is None:
         return None
-    issued = open_authority(config).issue(
-        Role.ROBOT, robot.name, robot.name.encode().ljust(32), robot.robot_id
-    )
-    return issued.files["identity.json"].decode()
+    authority = open_authority(config)
+    for name, robot in config.robots.items():
+        authority.issue(Role.ROBOT, name, name.encode().ljust(32), robot.robot_id)
+    return authority.members.text
 
 
 def failed(code: CheckCode, text: str = "x", *, settles: bool = False) -> dict[str, Any]:
@@ -109,7 +110,7 @@ def well(config: FleetConfig, name: str) -> Examination:
             "voxl-px4": {**runs}, "voxl-mavlink-server": {**runs}, "voxl-vision-hub": {**runs},
             "voxl-microdds-agent": {**idle}, "old_ros": {**idle},
         },
-        "containers": [], "card": card_of(config, robot), "group_keys": "00ff",
+        "containers": [], "members": members_of(config), "group_keys": "00ff",
         "factory_passwords": [],
         "drops_strangers": True,
         "open_ports": [{"protocol": "tcp", "port": 22, "program": "sshd"},
@@ -289,9 +290,12 @@ def container(**about: object) -> list[dict[str, object]]:
         ),
         (put("units.old_ros.enabled", True), "commanders", "FAILED", "starts at the next boot"),
         (put("drops_strangers", False), "doors", "warning", "lets root alone filter"),
-        (put("card", None), "card", "FAILED", "no card"),
-        (put("card", "{"), "card", "FAILED", "its card: "),
-        (put("card", '{"fleet":"x","authority":"00","card":"00"}'), "card", "FAILED", "not signed"),
+        (put("members", None), "member", "FAILED", "no list of the fleet's members"),
+        (put("members", "{"), "member", "FAILED", "members: does not begin with"),
+        (
+            put("members", f"fleet demo 1 0 {64 * 'a'}"),
+            "member", "FAILED", "its list of members is 1, and here is ",
+        ),
         (put("factory_passwords", ["root"]), "doors", "FAILED", "root: no password, or the one"),
         (
             put("open_ports", [{"protocol": "udp", "port": 14556, "program": "voxl-mavlink-s"}]),
@@ -373,8 +377,9 @@ def test_a_robot_is_judged_beside_the_others(config: FleetConfig) -> None:
     ):
         fleet["r1"] = fleet["r1"]._replace(pings=about)
         assert check("radio", r1, fleet)[1:3] == (verdict, found)
-    # A card is for one robot, and ssh may have another port.
-    assert check("card", r1, {"r1": well(config, "r2")}).found == "its card is r2's"
+    open_authority(config).revoke("r1")
+    assert check("member", r1, fleet).found == "it is not in the list of members"
+    # And ssh may have another port.
     doors = [{"protocol": "tcp", "port": port, "program": "sshd"} for port in (22, 2222)]
     fleet["r1"].facts["open_ports"][:] = doors
     moved = dataclasses.replace(r1, port=2222)

@@ -35,7 +35,7 @@ def test_a_start_far_ahead_is_reported_although_the_clock_is_right_by_now(
 
     monkeypatch.setattr(up, "measure_clock", right)
     monkeypatch.setattr(up, "lock", locked)
-    monkeypatch.setattr(up, "has_group_keys", lambda _: False)
+    monkeypatch.setattr(up, "bring_members", locked)
     config = load_fleet(ROOT / "docs" / "fleet.toml")
     robot = config.robots["r1"]
     arrival = asyncio.run(up._bring_up(config, robot, Robot(), lambda: 0.0))  # type: ignore[arg-type]

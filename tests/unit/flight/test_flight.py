@@ -697,10 +697,10 @@ def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: Wor
     world.closest = None
     world.failed_checks = (
         FailedCheck(CheckCode.NOT_DISARMED, "vehicle is armed"),
-        FailedCheck(CheckCode.CARD_NOT_GOOD, "its card is expired"),
+        FailedCheck(CheckCode.NOT_A_MEMBER, "its key is not listed"),
     )
     assert world.refuse("start") is RefusalCode.NOT_READY
-    world.reads(world.said, "its card is expired")
+    world.reads(world.said, "its key is not listed")
     world.failed_checks = world.failed_checks[:1]
     world.position_m[0] = 33.0
     assert world.refuse("start") is RefusalCode.OUTSIDE_FENCE

@@ -19,7 +19,7 @@ from edge.identity.group import (
     open_datagram,
 )
 from edge.identity.news import MessageNumber
-from edge.messages.topics import CARD, MESSAGE
+from edge.messages.topics import MESSAGE
 
 KEY, FORMER, ANOTHER = (GroupKey.of(bytes([n]) * 32) for n in range(3))
 numbers = st.builds(MessageNumber, st.integers(0, 2**48 - 1), st.integers(0, 2**32 - 1))
@@ -59,14 +59,14 @@ def test_a_message_comes_out_as_it_went_in(
     payload: bytes, sender: int, number: MessageNumber, key: GroupKey, random: object
 ) -> None:
     message = enclose(payload, number)
-    pieces = datagrams(message, topic=CARD, sender=sender, key=key)
+    pieces = datagrams(message, topic=MESSAGE, sender=sender, key=key)
     assert len(pieces) == frames(len(message)) <= 3
     assert all(len(piece) <= DATAGRAM_BYTES for piece in pieces)
     random.shuffle(pieces)  # type: ignore[attr-defined]
     fragments = [open_datagram(piece, (KEY, FORMER)) for piece in pieces]
     for fragment in fragments:
         assert fragment is not None
-        assert (fragment.topic, fragment.sender, fragment.number) == (CARD, sender, number)
+        assert (fragment.topic, fragment.sender, fragment.number) == (MESSAGE, sender, number)
     assert put_together(Assembly(), pieces) == [payload]
 
 

@@ -7,52 +7,46 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.identity.card import Card, CardError, Revocations, Role, signed
 from edge.identity.envelope import OVERHEAD_BYTES
-from edge.identity.guard import CardProblem, Membership, SignedGuard, Speaker, Unguarded
+from edge.identity.guard import Membership, SignedGuard, Speaker, Unguarded
+from edge.identity.members import Member as Listed
+from edge.identity.members import Members, MembersError, Role
 from edge.identity.news import MessageNumber
 from edge.identity.signature import Signer
-from edge.messages.topics import (
-    CARD,
-    GROUND_CARD,
-    HOLD,
-    MESSAGE,
-    ORDER,
-    REVOKED,
-    STATE,
-    STATUS,
-    ReceiveCallback,
-    Topic,
-)
+from edge.messages.topics import HOLD, MESSAGE, ORDER, STATE, STATUS, ReceiveCallback, Topic
 
 AUTHORITY = Signer(b"a" * 32)
 OTHER_FLEET = Signer(b"b" * 32)
 
 
-def membership(
-    role: Role,
-    name: str,
-    robot_id: int | None = None,
-    *,
-    authority: Signer = AUTHORITY,
-    start: int = 1,
-    serial: int = 1,
-    key: str = "",
-) -> Membership:
-    signer = Signer((key or f"{role} {name}").encode().ljust(32, b"."))
-    card = Card("demo", role, name, signer.public_key, serial, 2e9, robot_id)
-    return Membership(authority.public_key, signer, signed(card, authority), start)
+def signer(name: str) -> Signer:
+    return Signer(name.encode().ljust(32, b"."))
+
+
+def listed(role: Role, name: str, robot_id: int | None = None, key: str = "") -> Listed:
+    return Listed(role, name, robot_id, signer(key or name).public_key)
+
+
+ALL = (
+    *(listed(Role.ROBOT, f"r{robot_id}", robot_id) for robot_id in range(1, 10)),
+    listed(Role.OPERATOR, "ann"),
+    listed(Role.OBSERVER, "guest"),
+)
+
+
+def members(number: int = 1, *, without: str = "", authority: Signer = AUTHORITY) -> Members:
+    known = tuple(member for member in ALL if member.name != without)
+    return Members("demo", number, authority.public_key, known)
 
 
 class Member:
     """A guard, what it hears, and what it sends: by topic, as it goes over the air."""
 
-    def __init__(
-        self, member: Membership, revocations: bytes = b"", *, sends_again: bool = True
-    ) -> None:
+    def __init__(self, own: Listed, *, start: int = 1, list_: Members | None = None) -> None:
         self.now_s = 0.0
-        self.sends_again = sends_again
-        self.guard = SignedGuard(member, lambda: self.now_s, revocations)
+        self.own = own
+        membership = Membership(own, signer(own.name), list_ or members(), start)
+        self.guard = SignedGuard(membership, lambda: self.now_s)
         self.heard: list[tuple[str, bytes, Speaker]] = []
         topics: Mapping[Topic, ReceiveCallback] = self.guard.subscriptions(
             dict.fromkeys(
@@ -82,8 +76,7 @@ class Member:
         return self.sent
 
     def key(self, topic: Topic) -> str:
-        card = self.guard.card
-        sender = "ground" if card.robot_id is None else f"robot/{card.robot_id}"
+        sender = "ground" if self.own.robot_id is None else f"robot/{self.own.robot_id}"
         return f"{sender}/{topic.name}"
 
     def hear(self, other: "Member", sent: list[tuple[Topic, bytes]], key: str = "") -> None:
@@ -96,8 +89,12 @@ class Member:
         return len(self.heard) > before
 
 
-def robot(robot_id: int, **changes: object) -> Member:
-    return Member(membership(Role.ROBOT, f"r{robot_id}", robot_id, **changes))  # type: ignore[arg-type]
+def robot(robot_id: int, start: int = 1, list_: Members | None = None) -> Member:
+    return Member(ALL[robot_id - 1], start=start, list_=list_)
+
+
+def operator(start: int = 1) -> Member:
+    return Member(listed(Role.OPERATOR, "ann"), start=start)
 
 
 @pytest.fixture
@@ -106,71 +103,22 @@ def one() -> Member:
 
 
 @pytest.fixture
-def two(one: Member) -> Member:
-    """Known to `one`, which heard its card."""
-    member = robot(2)
-    one.hear(member, member.say(MESSAGE, b"first"))
-    return member
+def two() -> Member:
+    return robot(2)
 
 
-def test_a_program_that_began_again_is_shown_the_cards_soon(one: Member, two: Member) -> None:
-    one.say(MESSAGE, b"")
-    one.now_s = 1.0
-    one.hear(two, two.say(MESSAGE, b"still the same"))
-    assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
-    again = robot(2, start=2)
-    one.hear(again, again.say(MESSAGE, b"begun again")[1:])
-    assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
-
-
-def test_a_member_shows_its_card_and_is_heard_as_itself(one: Member) -> None:
-    two = robot(2)
-    (topic, card), (_, message) = sent = two.say(MESSAGE, b"hello")
-    assert topic is CARD and len(message) == len(b"hello") + OVERHEAD_BYTES
-    # Unknown as long as its card was not heard; then at once.
-    assert not one.takes(MESSAGE, "robot/2/message", message)
+def test_a_program_is_heard_with_its_first_message(one: Member, two: Member) -> None:
+    ((topic, message),) = sent = two.say(MESSAGE, b"hello")
+    assert topic is MESSAGE and len(message) == len(b"hello") + OVERHEAD_BYTES
     one.hear(two, sent)
+    number, digest = MessageNumber(1, 1), members().digest
     assert one.heard == [
-        ("robot/2/message", b"hello", Speaker(Role.ROBOT, "r2", MessageNumber(1, 1)))
+        ("robot/2/message", b"hello", Speaker(Role.ROBOT, "r2", number, members=digest))
     ]
-    assert one.guard.refused() == {"unknown_key": 1}
-    # Who hears somebody new shows its own card soon.
-    assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
-    one.now_s = 0.1
-    assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
-    one.now_s = 2.1
-    assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
-    # The same card again is no news.
-    assert not one.takes(CARD, "robot/2/card", card)
-
-
-def test_cards_are_rare_once_all_know_all(one: Member, two: Member) -> None:
-    def shown_at_s(until_s: int) -> list[int]:
-        shown = []
-        for now_s in range(int(one.now_s), until_s):
-            one.now_s = float(now_s)
-            if CARD in [topic for topic, _ in one.say(MESSAGE, b"")]:
-                shown.append(now_s)
-        return shown
-
-    # `two` was new, and may have missed some.
-    assert shown_at_s(60) == [*range(0, 20, 2), *range(28, 60, 10)]
-    again = robot(2, start=2)
-    one.hear(again, again.say(MESSAGE, b"begun again"))
-    assert shown_at_s(100) == [*range(59, 79, 2), *range(87, 100, 10)]
-
-
-def test_where_cards_get_lost_whoever_is_new_is_shown_them_again_at_once() -> None:
-    one, two = Member(membership(Role.ROBOT, "r1", 1), sends_again=False), robot(2)
-    one.say(MESSAGE, b"")
-    one.now_s = 60.0
-    one.hear(two, two.say(MESSAGE, b"begun"))
-    shown_s = []
-    for tenths in range(600, 720):
-        one.now_s = tenths / 10.0
-        if CARD in [topic for topic, _ in one.say(MESSAGE, b"")]:
-            shown_s.append(round(one.now_s - 60.0, 1))
-    assert shown_s == [0.0, 0.5, 1.0, 3.0, 5.0, 7.0, 9.0, 11.0]
+    # Also of its next start, and a ground's.
+    for again, says in ((robot(2, start=2), MESSAGE), (operator(), STATE), (operator(2), STATE)):
+        one.hear(again, again.say(says, b"begun again"))
+    assert len(one.heard) == 4 and one.guard.refused() == {}
 
 
 @pytest.mark.parametrize("start", [4, 5])
@@ -190,7 +138,6 @@ def test_its_own_words_are_no_news_whoever_says_them_again(start: int) -> None:
 @given(at=st.integers(0, 10_000), bit=st.integers(0, 7), payload=st.binary(max_size=300))
 def test_no_changed_message_is_heard(at: int, bit: int, payload: bytes) -> None:
     one, two = robot(1), robot(2)
-    one.hear(two, two.say(MESSAGE, b"first"))
     ((_, data),) = two.say(MESSAGE, payload)
     changed = bytearray(data)
     changed[at % len(data)] ^= 1 << bit
@@ -199,12 +146,8 @@ def test_no_changed_message_is_heard(at: int, bit: int, payload: bytes) -> None:
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_are_a_message_or_a_card(data: bytes) -> None:
-    one = robot(1)
-    for topic, key in ((MESSAGE, "robot/2/message"), (CARD, "robot/2/card")):
-        assert not one.takes(topic, key, data)
-    one._topics[REVOKED]("ground/revoked", data)
-    assert one.guard.revocations == b""
+def test_no_bytes_are_a_message(data: bytes) -> None:
+    assert not robot(1).takes(MESSAGE, "robot/2/message", data)
 
 
 def test_a_message_counts_once_and_for_its_own_place_only(one: Member, two: Member) -> None:
@@ -258,56 +201,13 @@ def test_a_robots_key_is_no_operators_and_no_other_robots(one: Member, two: Memb
         (STATUS, "robot/1/status"),
     ):
         assert not one.takes(topic, key, data)
-    # A card for one is none for another.
-    one.hear(two, robot(3).say(STATUS, b"")[:1])
-    assert one.guard.refused()["not_allowed"] == 4
-
-
-def test_a_card_counts_in_its_owners_envelope_only(one: Member) -> None:
-    two, three = robot(2), membership(Role.ROBOT, "r3", 3)
-    one._topics[CARD]("robot/3/card", three.card_data)
-    one._topics[CARD]("robot/3/card", two.guard.seal(CARD, three.card_data))
-    assert one.guard.refused() == {"no_envelope": 1, "forged": 1}
-    ((_, status),) = Member(three).say(STATUS, b"here")[-1:]
-    assert not one.takes(STATUS, "robot/3/status", status)
-
-
-def test_a_ground_that_began_again_and_says_nothing_is_shown_the_cards_soon(one: Member) -> None:
-    """One that does not command shows its card alone."""
-
-    def ground(start: int) -> Member:
-        return Member(membership(Role.OPERATOR, "ann", start=start))
-
-    def introduced(member: Member) -> list[tuple[Topic, bytes]]:
-        member.sent = []
-        member.guard.introduce()
-        return member.sent
-
-    former, again = ground(1), ground(2)
-    one.hear(former, introduced(former))
-    one.say(MESSAGE, b"")
-    one.now_s = former.now_s = 60.0
-    one.say(MESSAGE, b"")
-    one.now_s = former.now_s = 61.0
-    one.hear(former, introduced(former))
-    assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
-    shown = introduced(again)
-    one.hear(again, shown)
-    assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
-    # Said again by somebody else, it is no news.
-    one.now_s = 61.5
-    one.hear(again, shown)
-    assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
+    assert one.guard.refused()["not_allowed"] == 3
 
 
 def test_an_observer_says_a_hold_and_nothing_else(one: Member) -> None:
-    observer = Member(membership(Role.OBSERVER, "guest"))
-    operator = Member(membership(Role.OPERATOR, "ann"))
-    for member, heard in ((observer, [True, False, False]), (operator, [True, True, True])):
-        sent = member.say(HOLD, b"hold")
-        assert [topic for topic, _ in sent] == [GROUND_CARD, HOLD]
-        one.hear(member, sent[:1])
-        said = [sent[1], *(member.say(topic, b"other")[-1] for topic in (ORDER, STATE))]
+    observer = Member(listed(Role.OBSERVER, "guest"))
+    for member, heard in ((observer, [True, False, False]), (operator(), [True, True, True])):
+        said = [(topic, *member.say(topic, b"other")[0][1:]) for topic in (HOLD, ORDER, STATE)]
         assert [one.takes(t, member.key(t), data) for t, data in said] == heard
     assert [(speaker.role, speaker.name) for *_, speaker in one.heard] == [
         (Role.OBSERVER, "guest"),
@@ -316,64 +216,87 @@ def test_an_observer_says_a_hold_and_nothing_else(one: Member) -> None:
 
 
 def test_another_fleet_is_not_heard_even_of_the_same_name_and_key(one: Member) -> None:
-    stranger = robot(2, authority=OTHER_FLEET)
+    stranger = robot(2, list_=members(authority=OTHER_FLEET))
     one.hear(stranger, stranger.say(MESSAGE, b"hello"))
-    assert not one.heard and one.guard.refused() == {"forged": 1, "unknown_key": 1}
-    # A key that both fleets have signs for one of them.
-    ours = robot(2)
-    one.hear(ours, ours.say(MESSAGE, b"")[:1])
-    assert not one.takes(MESSAGE, "robot/2/message", stranger.guard.seal(MESSAGE, b"hello"))
+    assert not one.heard and one.guard.refused() == {"forged": 1}
+
+
+def test_who_is_not_in_the_list_is_not_heard(one: Member, two: Member) -> None:
+    one.hear(two, two.say(MESSAGE, b"1"))
+    one.guard.take(members(2, without="r2"))
+    assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"2"))
+    assert one.guard.refused() == {"unknown_key": 1}
+    # It may still be there; and one that has the list knows why nobody listens.
+    assert one.guard.revoked_robots() == {2} and one.guard.is_listed()
+    assert two.guard.is_listed() and Unguarded(1).is_listed()
+    two.guard.take(members(2, without="r2"))
+    assert not two.guard.is_listed() and two.guard.revoked_robots() == {2}
+    # Whoever comes back is heard; what it said before is over.
+    one.guard.take(members(3))
+    assert one.guard.revoked_robots() == Unguarded(1).revoked_robots() == set()
+    assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"3"))
 
 
 def test_who_was_replaced_is_not_heard_any_more(one: Member, two: Member) -> None:
-    swapped = robot(2, serial=2, key="another computer")
-    one.hear(swapped, swapped.say(MESSAGE, b"I am two"))
-    assert one.heard[-1][1] == b"I am two"
+    swapped = listed(Role.ROBOT, "spare", 2)
+    others = tuple(member for member in ALL if member.robot_id != 2)
+    later = replace(members(2), members=(*others, swapped))
+    one.guard.take(later)
+    two.guard.take(later)
+    new = Member(swapped, list_=later)
+    assert one.takes(MESSAGE, "robot/2/message", new.guard.seal(MESSAGE, b"I am two"))
     assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"so am I"))
-    # The former card does not come back, and its holder knows why nobody listens.
-    two.now_s = 9.0
-    one.hear(two, two.say(MESSAGE, b"hello?"))
-    assert one.heard[-1][1] == b"I am two"
-    assert two.guard.card_problem(1.9e9) is None
-    assert two.guard.card_problem(2.1e9) is CardProblem.EXPIRED
-    swapped.now_s = 9.0
-    two.hear(swapped, swapped.say(MESSAGE, b"")[:1])
-    assert two.guard.card_problem(1.9e9) is CardProblem.REPLACED
+    assert new.guard.is_listed() and not two.guard.is_listed()
+    assert one.guard.revoked_robots() == set()
 
 
-def test_a_revoked_key_is_not_heard_and_a_list_only_grows(one: Member, two: Member) -> None:
-    lists = [
-        signed(Revocations(count, tuple(fingerprints)), AUTHORITY)
-        for count, fingerprints in ((1, []), (2, [two.guard.card.fingerprint.hex()]), (3, []))
-    ]
-    forged = signed(Revocations(9, ()), OTHER_FLEET)
-    assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"1"))
-    for data in (lists[0], lists[1], forged, lists[0]):
-        one._topics[REVOKED]("ground/revoked", data)
-    assert one.guard.revocations == lists[1]
-    assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"2"))
-    assert one.guard.revoked_robots() == {2}
-    # It is known from the disk, too, and to who was revoked.
-    revoked = Member(membership(Role.ROBOT, "r2", 2), lists[1])
-    assert revoked.guard.card_problem(1.9e9) is CardProblem.REVOKED
-    # An operator carries it on, an observer does not.
-    operator = Member(membership(Role.OPERATOR, "ann"), lists[1])
-    assert (REVOKED, lists[1]) in operator.say(STATE, b"")
-    observer = Member(membership(Role.OBSERVER, "guest"), lists[1])
-    assert REVOKED not in dict(observer.say(STATE, b""))
-    one._topics[REVOKED]("ground/revoked", lists[2])
-    assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"3"))
-    assert one.guard.revoked_robots() == Unguarded(1).revoked_robots() == set()
+@pytest.mark.parametrize(
+    ("other", "problem"),
+    [
+        (members(1), "list 1 is not newer than 2"),
+        (members(2, without="r3"), "list 2 is not newer than 2"),
+        (members(3, authority=OTHER_FLEET), "is another fleet's"),
+        (replace(members(3), fleet="field"), "is another fleet's"),
+    ],
+)
+def test_a_list_that_is_older_or_another_fleets_is_not_taken(
+    one: Member, other: Members, problem: str
+) -> None:
+    one.guard.take(members(2))
+    one.guard.take(members(2))
+    with pytest.raises(MembersError, match=problem):
+        one.guard.take(other)
+    assert one.guard.members == members(2)
 
 
-def test_a_card_must_be_the_keys_beside_it() -> None:
-    member = membership(Role.ROBOT, "r1", 1)
-    with pytest.raises(CardError, match="for another key"):
-        SignedGuard(replace(member, signer=Signer(b"x" * 32)), lambda: 0.0)
-    with pytest.raises(CardError, match="has not signed it"):
-        SignedGuard(replace(member, authority=OTHER_FLEET.public_key), lambda: 0.0)
-    with pytest.raises(ValueError, match="a robot has one, and nobody else"):
-        Card("demo", Role.ROBOT, "r1", b"k" * 32, 1, 2e9)
+def test_who_has_another_list_is_named_while_it_is_heard(one: Member, two: Member) -> None:
+    ground = operator()
+
+    def both_speak() -> str:
+        one.hear(two, two.say(MESSAGE, b""))
+        one.hear(ground, ground.say(STATE, b""))
+        return one.guard.members_differ()
+
+    assert both_speak() == Unguarded(1).members_differ() == ""
+    ground.guard.take(members(2))
+    assert both_speak() == (
+        "the list of members here is 1, and ann has 2, which is newer: run `lpac fleet up`"
+    )
+    two.guard.take(members(2))
+    one.guard.take(members(3))
+    assert "is 3, and r2 has 2, which is older, ann has 2, which is older:" in both_speak()
+    two.guard.take(members(3, without="r4"))
+    ground.guard.take(members(3))
+    assert "is 3, and r2 has another 3:" in both_speak()
+    # What it said before on another topic does not count, nor what it said long ago.
+    one.hear(two, two.say(STATUS, b""))
+    one.now_s = 4.0
+    two.guard.take(members(4))
+    one.guard.take(members(4))
+    one.hear(two, two.say(MESSAGE, b""))
+    assert "ann has 3" in one.guard.members_differ() and "r2" not in one.guard.members_differ()
+    one.now_s = 9.5
+    assert one.guard.members_differ() == ""
 
 
 def test_without_a_guard_a_message_is_its_keys() -> None:
@@ -409,7 +332,7 @@ def begun(robot_id: int, at_s: float) -> Member:
 def thief(robot_id: int, ahead_ms: float, sequence: int = 2**32 - 1) -> Member:
     """Somebody with that robot's key, `ahead_ms` ahead of `NOW_S`, and then of every sequence."""
     member = robot(robot_id, start=min(int(1e3 * NOW_S + ahead_ms), 2**48 - 1))
-    for topic in (MESSAGE, STATUS, CARD):
+    for topic in (MESSAGE, STATUS):
         member.guard._sequences[member.key(topic)] = sequence - 1
     return member
 
@@ -417,7 +340,7 @@ def thief(robot_id: int, ahead_ms: float, sequence: int = 2**32 - 1) -> Member:
 def speak(
     hearer: Member, member: Member, until_s: float, topic: Topic = MESSAGE
 ) -> list[tuple[str, bytes, Speaker]]:
-    """Return what is heard of a member that speaks at 4 Hz and shows its card."""
+    """Return what is heard of a member that speaks at 4 Hz."""
     before = len(hearer.heard)
     while hearer.now_s < until_s:
         hearer.now_s += 0.25
@@ -427,7 +350,6 @@ def speak(
 
 
 def packet(member: Member, topic: Topic = MESSAGE) -> list[tuple[Topic, bytes]]:
-    """One message alone, without its card."""
     return [(topic, member.guard.seal(topic, b"stolen"))]
 
 
@@ -483,27 +405,13 @@ def test_a_clock_that_is_set_back_makes_nobody_deaf_in_flight(one: Member) -> No
     assert len(speak(one, two, 2.0)) == 4 and not one.guard.robots_ahead()
 
 
-def test_a_card_of_an_earlier_start_is_not_taken_for_the_robots(one: Member) -> None:
-    """The link would take an earlier start for the one that lives."""
-    shown = one.guard.subscriptions({})[CARD]
-
-    def card(member: Member) -> bytes:
-        return member.guard.seal(CARD, member.guard._membership.card_data)
-
-    former = card(robot(2, start=1))
-    assert shown("robot/2/card", former) is True
-    assert shown("robot/2/card", card(robot(2, start=2))) is True
-    assert shown("robot/2/card", former) is False
-    assert one.guard.refused() == {}
-
-
 def test_a_ground_is_heard_whatever_its_clock_was(one: Member) -> None:
     """Robots in flight hear their ground, though its laptop's clock was wrong once."""
     one.guard.hear_time(NOW_S)
-    ground = Member(membership(Role.OPERATOR, "ann", start=int(1e3 * NOW_S + 30 * DAY_MS)))
+    ground = operator(int(1e3 * NOW_S + 30 * DAY_MS))
     assert speak(one, ground, 1.0, STATE)
     # Its clock was set right, and it started again.
-    again = Member(membership(Role.OPERATOR, "ann", start=int(1e3 * (NOW_S + 2.0))))
+    again = operator(int(1e3 * (NOW_S + 2.0)))
     assert speak(one, again, 3.0, STATE)
 
 
@@ -530,7 +438,7 @@ PLACE = "192.0.2.1:7447"
 
 def test_a_knock_counts_once_and_of_members_alone(one: Member) -> None:
     """Of one that was never heard, too; a stranger who recorded it gets in nowhere with it."""
-    two, ground = robot(2), Member(membership(Role.OPERATOR, "ann"))
+    two, ground = robot(2), operator()
     for member in (two, ground):
         knock = member.guard.knock(PLACE)
         assert not one.guard.is_knock(knock, "192.0.2.2:7447")
@@ -539,19 +447,14 @@ def test_a_knock_counts_once_and_of_members_alone(one: Member) -> None:
         changed = bytearray(member.guard.knock(PLACE))
         changed[-1] ^= 1
         assert not one.guard.is_knock(bytes(changed), PLACE)
-    # Nor with the own one, nor a card that was shown, nor as another.
+    # Nor with the own one, nor with what was said, nor as another.
     assert not one.guard.is_knock(one.guard.knock(PLACE), PLACE)
-    assert not one.guard.is_knock(two.guard.seal(CARD, two.guard._membership.card_data), PLACE)
-    assert not one.guard.is_knock(robot(2, authority=OTHER_FLEET).guard.knock(PLACE), PLACE)
-    thief = robot(3)
-    assert not one.guard.is_knock(
-        thief.guard._seal(f"robot/2/knock/{PLACE}", membership(Role.ROBOT, "r2", 2).card_data),
-        PLACE,
-    )
-    revoked = signed(Revocations(1, (two.guard.card.fingerprint.hex(),)), AUTHORITY)
-    assert one.guard.hear_revocations(revoked) and not one.guard.is_knock(
-        two.guard.knock(PLACE), PLACE
-    )
+    assert not one.guard.is_knock(two.guard.seal(MESSAGE, b""), PLACE)
+    stranger = robot(2, list_=members(authority=OTHER_FLEET))
+    assert not one.guard.is_knock(stranger.guard.knock(PLACE), PLACE)
+    assert not one.guard.is_knock(robot(3).guard._seal(f"robot/2/knock/{PLACE}", b""), PLACE)
+    one.guard.take(members(2, without="r2"))
+    assert not one.guard.is_knock(two.guard.knock(PLACE), PLACE)
 
 
 @given(st.binary(max_size=300))

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 from edge.core.fence import Fence
-from edge.identity.card import Card, Revocations
 from edge.messages.codec import MessageError, decode, encode
 from edge.messages.codes import CheckCode, ReasonCode
 from edge.messages.mission import (
@@ -148,7 +147,7 @@ CHECKED_BY_ITS_TYPE = {
 
 @pytest.mark.parametrize(
     "kind",
-    [GroundState, Order, RobotStatus, SafetyForm, OrderForm, Card, Revocations],
+    [GroundState, Order, RobotStatus, SafetyForm, OrderForm],
     ids=lambda kind: kind.__name__,
 )
 def test_every_number_text_and_list_has_a_bound(kind: type) -> None:

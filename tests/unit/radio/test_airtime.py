@@ -14,11 +14,9 @@ from edge.identity.envelope import OVERHEAD_BYTES
 from edge.messages.bounds import MOST_ROBOTS
 from edge.messages.codec import encode
 from edge.messages.mission import Echo, GroundState, RadioCounts
-from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATE, STATUS
+from edge.messages.topics import EXPLORED, MESSAGE, STATE, STATUS
 from lpac.radio.airtime import (
-    CARD_BYTES,
     EXPLORED_BYTES,
-    GROUND_CARD_BYTES,
     MESSAGE_BYTES,
     TRANSPORTS,
     Traffic,
@@ -325,8 +323,6 @@ def test_all_sizes_are_within_their_topics_limits() -> None:
         (STATUS, status_bytes(MOST_ROBOTS)),
         (STATE, state_bytes(MOST_ROBOTS)),
         (EXPLORED, EXPLORED_BYTES),
-        (CARD, CARD_BYTES),
-        (GROUND_CARD, GROUND_CARD_BYTES),
     ):
         assert size <= topic.limit_bytes
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.identity.card import Role
 from edge.identity.guard import Speaker
+from edge.identity.members import Role
 from edge.messages.codec import encode
 from edge.messages.mission import Echo, GroundState, Hold, Order, OrderForm, Origin
 from edge.robot.inbox import Inbox

@@ -13,32 +13,35 @@ def nothing(*_: Any) -> None:
     pass
 
 
-def program_of(keep_news: Callable[[], None] | None = None, **steps: Any) -> _Program:
+def program_of(take_up: Callable[..., None] | None = None, **steps: Any) -> _Program:
     """Make a program whose node does nothing in steps other than these."""
     names = ("control", "perception", "policy", "preflight", "status")
     node: Any = SimpleNamespace(
-        **{f"{name}_step": nothing for name in names} | steps, leave=nothing, identity_problem=""
+        **{f"{name}_step": nothing for name in names} | steps,
+        leave=nothing,
+        identity_problem="",
+        on_ground=True,
     )
     config: Any = SimpleNamespace(
         rates=SimpleNamespace(control_hz=10.0, perception_hz=5.0, policy_hz=2.5), on_stop="land"
     )
     recorder: Any = SimpleNamespace(flush=nothing)
     rest: Any = SimpleNamespace()
-    return _Program(config, node, rest, rest, recorder, rest, keep_news)
+    return _Program(config, node, rest, rest, recorder, rest, take_up)
 
 
 def test_what_cannot_be_kept_is_told_for_as_long_and_logged_once() -> None:
-    problems: list[OSError | None] = [OSError(28, "No space left on device", "revoked")]
+    problems: list[OSError | None] = [OSError(28, "No space left on device", "start")]
 
-    def keep() -> None:
+    def take_up(**_: bool) -> None:
         if problems[-1] is not None:
             raise problems[-1]
 
-    program = program_of(keep)
+    program = program_of(take_up)
     with lines_said() as lines:
         program._write_step()
         program._write_step()
-    assert program._node.identity_problem.startswith("revoked: ")
+    assert program._node.identity_problem.startswith("start: ")
     assert [line["event"] for line in lines] == ["identity not written"]
     problems.append(None)
     program._write_step()
