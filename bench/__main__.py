@@ -17,6 +17,7 @@ BENCHES = (
     "simulated",
     "usual",
     "loops",
+    "flood",
 )
 
 

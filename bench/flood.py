@@ -1,0 +1,122 @@
+"""Lateness of control while nobody, an outsider and a member flood the radio."""
+
+import itertools
+import json
+import multiprocessing
+import tempfile
+import time
+from contextlib import ExitStack
+from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import zenoh
+
+from bench import BUNDLE
+from bench.result import Result, Table, Target, progress
+from edge.drivers.identity_folder import load_identity
+from lpac.sim.engines import require_flown
+from lpac.sim.fleet.flight import FleetMoment, fly_programs
+from lpac.sim.fleet.processes import Fleet
+from lpac.sim.scenario import Scenario
+
+RATE_HZ = 10_000
+# Each message in its turn: of one robot, of the ground, and of names that nobody has.
+_OUTSIDERS = ("robot/2/message", "ground/state", *(f"robot/{id_}/message" for id_ in range(9, 109)))
+_MEMBERS = ("robot/2/message",)
+_STEP_S = 0.01
+
+
+def measure(robots: int = 3, mission_s: float = 60.0) -> Result:
+    """Fly three missions of `robots` robots; who is a member floods with robot 2's certificate."""
+    rows, p99_ms = [], {}
+    for who in ("nobody", "an outsider", "a member"):
+        progress(f"flood: {robots} robots fly, {who} floods, about two minutes")
+        late_ms, rate_hz = _fly(who, robots, mission_s)
+        p99_ms[who] = max(late_ms)
+        rows.append((who, f"{rate_hz:.0f}", *(f"{each:.1f}" for each in sorted(late_ms))))
+    return Result(
+        "flood",
+        {"p99_ms": p99_ms},
+        [
+            Table(
+                "Lateness of each robot's control loop in a mission, ms, p99 of a minute",
+                ("who floods", "messages/s", *(["a robot"] * robots)),
+                rows,
+            )
+        ],
+        [
+            Target(f"control is late, p99 ms, {who} floods", p99_ms[who], 20, at_least=False)
+            for who in ("an outsider", "a member")
+        ],
+        ["Every message goes to every robot. Vehicles, operator and flood share the cores."],
+    )
+
+
+def _fly(who: str, robots: int, mission_s: float) -> tuple[list[float], float]:
+    """Lateness of each robot at the mission's end, p99 ms, and how many messages a second came."""
+    spawning = multiprocessing.get_context("spawn")
+    over, sent, began_s, lasted_s = spawning.Event(), spawning.Value("q", 0), 0.0, 1.0
+    late_ms: list[float] = []
+
+    def watch(moment: FleetMoment) -> None:
+        nonlocal began_s, lasted_s, late_ms
+        if moment.step == "mission":
+            loops = [status.loops for status in moment.statuses.values()]
+            late_ms = [its["control"].lateness_p99_ms for its in loops if "control" in its]
+            if not began_s:
+                began_s = time.monotonic()
+                if who != "nobody":
+                    flood.start()
+        elif began_s and not over.is_set():
+            over.set()
+            lasted_s = time.monotonic() - began_s
+
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        scenario = Scenario(robots=robots, seed=7, duration_s=mission_s, secure=who == "a member")
+        fleet = Fleet(scenario, Path(folder), BUNDLE)
+        keys = fleet.robots[2].folder / "identity" if who == "a member" else None
+        flood = spawning.Process(
+            target=_flood, args=(fleet.name, fleet.endpoints, keys, over, sent), daemon=True
+        )
+        stack.callback(over.set)
+        flight = fly_programs(fleet, watch=watch)
+    require_flown(flight)
+    return late_ms, sent.value / lasted_s
+
+
+def _flood(
+    fleet: str,
+    endpoints: tuple[str, ...],
+    keys: Path | None,
+    over: Event,
+    sent: "Synchronized[int]",
+) -> None:
+    """A program that speaks zenoh and keeps to no rule, with the keys in that folder."""
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "connect/endpoints": endpoints,
+        "listen/endpoints": [f"{'tcp' if keys is None else 'tls'}/127.0.0.1:0"],
+        **({} if keys is None else {"transport/link/tls": _certified(keys, fleet)}),
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    names = itertools.cycle(_OUTSIDERS if keys is None else _MEMBERS)
+    began_s, count = time.monotonic(), 0
+    with zenoh.open(config) as session:
+        while not over.wait(_STEP_S):
+            due = int((time.monotonic() - began_s) * RATE_HZ)
+            for name in itertools.islice(names, due - count):
+                session.put(f"lpac/{fleet}/{name}", bytes(100))
+            count = sent.value = due
+
+
+def _certified(keys: Path, fleet: str) -> dict[str, object]:
+    files = load_identity(keys, fleet=fleet, unix_s=time.time()).tls
+    return {
+        "root_ca_certificate": files.authority, "enable_mtls": True,
+        "verify_name_on_connect": False,
+        "listen_private_key": files.key, "listen_certificate": files.certificate,
+        "connect_private_key": files.key, "connect_certificate": files.certificate,
+    }  # fmt: skip
