@@ -23,20 +23,19 @@ from edge.messages.mission import (
     Hold,
     LoopStatus,
     Order,
-    OrderForm,
     OrderResult,
     Origin,
     Place,
     RadioCounts,
     RobotStatus,
-    SafetyForm,
+    SafetyRequest,
 )
 from handbook.markdown import cell, table
 from lpac.ground import record
 
 MESSAGES = (
     RobotStatus, GroundState, Hold, Order, OrderResult, FailedCheck, Reason, Refusal, Origin, Fence,
-    Place, Echo, LoopStatus, RadioCounts, SafetyForm, OrderForm,
+    Place, Echo, LoopStatus, RadioCounts, SafetyRequest,
 )  # fmt: skip
 CODES = (FlightState, CheckCode, ReasonCode, RefusalCode)
 _LAYOUTS = {

@@ -55,6 +55,7 @@ class Rejection(StrEnum):
     TOO_LONG = "too_long"
     PAYLOAD_TYPE = "payload_type"
     COMPRESSION = "compression"
+    OTHER_RELEASE = "other_release"
     OTHER_BUNDLE = "other_bundle"
     OTHER_FRAME = "other_frame"
     OWN = "own"

@@ -25,8 +25,6 @@ from edge.messages.mission import (
     ORDER_LIFETIME_S,
     FlightState,
     Order,
-    OrderForm,
-    OrderKind,
     OrderResult,
 )
 
@@ -54,6 +52,12 @@ class OrderRule:
     moves_nothing: bool = False
     arms: bool = False
     trial: Literal["kept", "begins", "forgotten"] = "kept"
+
+
+def _other_release(t: Tick) -> Refusal | None:
+    release = t.inputs.other_release
+    text = f"the ground flies another release ({release}) than this robot: deploy one to all"
+    return Refusal(RefusalCode.OTHER_RELEASE, text) if release else None
 
 
 def _ground_commands(t: Tick) -> Refusal | None:
@@ -129,18 +133,20 @@ def _cannot_start(t: Tick) -> Refusal | None:
     return None if near is None else Refusal(RefusalCode.TOO_CLOSE, near)
 
 
-ORDERS: Mapping[OrderKind, OrderRule] = {
+ORDERS: Mapping[str, OrderRule] = {
     "takeoff": OrderRule(
-        taken_in=(_S.PREFLIGHT,), checks=(_ground_commands, _not_ready), arms=True
+        taken_in=(_S.PREFLIGHT,), checks=(_other_release, _ground_commands, _not_ready), arms=True
     ),
     "start": OrderRule(
         taken_in=(_S.HOLD,),
-        checks=(_ground_commands, _not_a_member, _not_in_place, _cannot_start),
+        checks=(_other_release, _ground_commands, _not_a_member, _not_in_place, _cannot_start),
         trial="begins",
     ),
     # Also in PILOT, where it has no effect.
     "pilot": OrderRule(taken_in=(_S.HOLD, _S.MISSION, _S.RETURN, _S.PILOT)),
-    "rejoin": OrderRule(taken_in=(_S.PILOT,), checks=(_ground_commands, _not_in_place)),
+    "rejoin": OrderRule(
+        taken_in=(_S.PILOT,), checks=(_other_release, _ground_commands, _not_in_place)
+    ),
     "reset": OrderRule(
         taken_in=tuple(s for s in _S if s not in (_S.ARMING, _S.TAKEOFF, _S.MISSION)),
         moves_nothing=True, trial="forgotten",
@@ -150,7 +156,7 @@ ORDERS: Mapping[OrderKind, OrderRule] = {
 }  # fmt: skip
 
 
-def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order | OrderForm | None:
+def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order | None:
     """The tick's order, unless it is for another robot or was answered before."""
     order = inputs.order
     if order is None or order.robot_id != robot.robot_id:
@@ -158,7 +164,7 @@ def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order
     return None if any(a.order_id == order.order_id for a in flight.answers) else order
 
 
-def refusal(t: Tick, order: Order | OrderForm) -> Refusal | None:
+def refusal(t: Tick, order: Order) -> Refusal | None:
     """Reason of a refusal; None if the order is accepted."""
     if order.boot_nonce != t.robot.boot_nonce:
         return Refusal(RefusalCode.OTHER_START, "meant for another start of this robot's program")
@@ -168,9 +174,9 @@ def refusal(t: Tick, order: Order | OrderForm) -> Refusal | None:
             return Refusal(RefusalCode.EXPIRED, "expired")
         text = f"would be valid for {left_s:.0f} s: too long"
         return Refusal(RefusalCode.VALID_TOO_LONG, text)
-    if isinstance(order, OrderForm):
+    rule, ground = ORDERS.get(order.kind), t.inputs.ground
+    if rule is None:
         return Refusal(RefusalCode.NOT_UNDERSTOOD, f"this program does not understand {order.kind}")
-    rule, ground = ORDERS[order.kind], t.inputs.ground
     if rule.from_anybody:
         return None
     if ground is not None and order.operator != ground.operator:
@@ -195,9 +201,7 @@ def refusal(t: Tick, order: Order | OrderForm) -> Refusal | None:
     return _first_problem(t, rule.checks)
 
 
-def answered(
-    flight: FlightMemory, order: Order | OrderForm, refused: Refusal | None
-) -> FlightMemory:
+def answered(flight: FlightMemory, order: Order, refused: Refusal | None) -> FlightMemory:
     """The memory with the order's answer; `refused` is None if it was obeyed."""
     answer = OrderResult(order.order_id, refused)
     expiry_s = flight.obeyed_expiry_s

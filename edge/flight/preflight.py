@@ -51,12 +51,13 @@ class PreflightInputs:
     mission frame; the slot's height is above the takeoff point. `errors` determine the distances of
     robots. `failsafe_problems` come from `failsafe.check`, None before the vehicle's parameters
     were read. `fence_changed`: the vehicle had the right fence, and somebody else changed it.
-    `neighbours` are the robots heard recently, `not_understood` those with unreadable messages,
+    `neighbours` are the robots heard recently, `strangers` those with unreadable messages,
     `unheard` those heard by the ground only, `fell_silent` those that fell silent in flight and may
     still be in the air, as of their last message; `separation` has the distance from them.
-    `ground_age_s` is the age of the ground's last message, None if there was none; the fleet's time
-    is known to `time_uncertainty_s`, None if unknown. `has_answer`: the policy has answered
-    recently. `answer_problem` is the fault of the sensor's or policy's last result, "" if unknown.
+    `ground_release` is the ground's release, "" if it is this robot's. `ground_age_s` is the age of
+    the ground's last message, None if there was none; the fleet's time is known to
+    `time_uncertainty_s`, None if unknown. `has_answer`: the policy has answered recently.
+    `answer_problem` is the fault of the sensor's or policy's last result, "" if unknown.
     """
 
     now_s: float
@@ -80,7 +81,8 @@ class PreflightInputs:
     min_separation_m: float
     errors: ErrorBudget
     neighbours: Sequence[HeardBeacon]
-    not_understood: Sequence[str]
+    strangers: Sequence[str]
+    ground_release: str
     unheard: Sequence[int]
     fell_silent: Sequence[Neighbour]
     separation: SeparationLimits
@@ -333,11 +335,14 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
             CheckCode.DUPLICATE_ID,
             f"another program says that it is robot {inputs.robot_id}: stop it, or change its id",
         )
-    for robot in inputs.not_understood:
-        yield FailedCheck(
-            CheckCode.NOT_UNDERSTOOD,
-            f"{robot} runs another version of this program: deploy one to all",
-        )
+    releases = [(f"robot {beacon.robot_id}", beacon.other_release) for beacon, *_ in others]
+    unreadable = [(name, "not readable") for name in inputs.strangers]
+    for who, release in (*releases, ("the ground", inputs.ground_release), *unreadable):
+        if release:
+            yield FailedCheck(
+                CheckCode.OTHER_RELEASE,
+                f"{who} flies another release ({release}) than this robot: deploy one to all",
+            )
     for robot_id in inputs.unheard:
         yield FailedCheck(
             CheckCode.OTHER_NOT_HEARD,

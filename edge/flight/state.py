@@ -33,7 +33,6 @@ from edge.messages.mission import (
     FlightState,
     GroundState,
     Order,
-    OrderForm,
     OrderResult,
     Place,
     SafetyAction,
@@ -160,13 +159,13 @@ class FlightInputs:
     sea level without its jumps in flight; None when the position is lost or old, or without a
     mission origin. `policy_velocity_m_s` (2,) is None without a fresh answer of the policy;
     `policy_problem` is the known cause, or "". `neighbours` are those heard, `closest` the nearest
-    of them. `busy_neighbours` report that they arm or take off. `safety_form` is the request of a
-    ground whose states are not understood. `failed_checks` are preflight's; None before the first.
-    `not_taken` are parts of the ground's state that the robot does not use. `order` is new in this
-    tick, or the form of one that is not understood. `energy` is None if the battery is unknown.
-    `lands_beside_m` (2,) is the place of landing if another robot stands at the landing point.
-    `fell_silent` are robots that fell silent in flight and may still be in the air, as of their
-    last message. `px4_change` is None while PX4 is as preflight found it.
+    of them. `busy_neighbours` report that they arm or take off. `safety_request` is the request of
+    a ground whose states are refused; `other_release` is the ground's release, "" if it is this
+    robot's. `failed_checks` are preflight's; None before the first. `not_taken` are parts of the
+    ground's state that the robot does not use. `order` is new in this tick. `energy` is None if the
+    battery is unknown. `lands_beside_m` (2,) is the place of landing if another robot stands at the
+    landing point. `fell_silent` are robots that fell silent in flight and may still be in the air,
+    as of their last message. `px4_change` is None while PX4 is as preflight found it.
     """
 
     now_s: float
@@ -179,16 +178,17 @@ class FlightInputs:
     busy_neighbours: tuple[int, ...]
     ground: GroundState | None
     ground_age_s: float
-    safety_form: SafetyAction
+    safety_request: SafetyAction
     failed_checks: tuple[FailedCheck, ...] | None
     not_taken: tuple[FailedCheck, ...]
-    order: Order | OrderForm | None
+    order: Order | None
     uptime_s: float
     energy: Energy | None
     lands_beside_m: tuple[float, float] | None = None
     fell_silent: tuple[Neighbour, ...] = ()
     policy_problem: str = ""
     px4_change: Px4Change | None = None
+    other_release: str = ""
 
 
 @dataclass(frozen=True)
@@ -322,9 +322,9 @@ class Tick:
 
     @property
     def safety_action(self) -> SafetyAction:
-        ground, form = self.inputs.ground, self.inputs.safety_form
-        if form != "none" or ground is None or not self.ground_heard:
-            return form
+        ground, request = self.inputs.ground, self.inputs.safety_request
+        if request != "none" or ground is None or not self.ground_heard:
+            return request
         asked = ground.safety_action_for(self.robot.robot_id)
         enabled = ground.enabled_for(self.robot.robot_id)
         return "hold" if asked == "none" and not enabled else asked

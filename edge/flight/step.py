@@ -24,7 +24,7 @@ from edge.flight.state import (
 )
 from edge.flight.transitions import TRANSITIONS, Transition, by_state
 from edge.messages.codes import Reason, Refusal, RefusalCode
-from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, Order, OrderKind
+from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState
 
 _S = FlightState
 ROWS = by_state(TRANSITIONS)
@@ -56,7 +56,7 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
     order = new_order(robot, flight, inputs)
     tick = Tick(robot, flight, inputs)
     refused = None if order is None else refusal(tick, order)
-    taken = order if isinstance(order, Order) and refused is None else None
+    taken = order if refused is None else None
     row, reason = _first_row(tick, None if taken is None else taken.kind)
     overruled = row is not None and row.order is None
     if taken is not None and overruled and not ORDERS[taken.kind].moves_nothing:
@@ -162,7 +162,7 @@ def _as_needed(state: FlightState, vehicle: VehicleState) -> bool:
     return vehicle.mode is (Mode.LAND if state is _S.LAND else Mode.OFFBOARD)
 
 
-def _first_row(tick: Tick, ordered: OrderKind | None) -> tuple[Transition | None, str]:
+def _first_row(tick: Tick, ordered: str | None) -> tuple[Transition | None, str]:
     for row in ROWS[tick.flight.state]:
         if row.order is None or row.order == ordered:
             reason = row.why(tick)

@@ -5,7 +5,7 @@ Little-endian, 29 bytes before the payload, and the signature behind it:
 | offset | type | field |
 | --- | --- | --- |
 | 0 | 2 bytes | magic, `LE` |
-| 2 | uint8 | version of this layout and of what is behind it, 2 |
+| 2 | uint8 | version of this layout, and of the beacon's behind it, 2 |
 | 3 | 4 bytes | the sender's release |
 | 7 | 4 bytes | digest of the sender's list of members; zeros in a fleet without keys |
 | 11 | 8 bytes | the sender's key, by its fingerprint; zeros in a fleet without keys |
@@ -117,6 +117,11 @@ def read_head(data: bytes) -> Head | None:
         return None
     number = MessageNumber(int.from_bytes(start, "little"), sequence)
     return Head(release, members, fingerprint, number)
+
+
+def is_of_other_version(data: bytes) -> bool:
+    """Whether it is an envelope of a layout that is not known here."""
+    return data.startswith(_MAGIC) and data[len(_MAGIC) : len(_MAGIC) + 1] != bytes((_VERSION,))
 
 
 def read_envelope(data: bytes) -> Envelope | None:

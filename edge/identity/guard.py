@@ -20,6 +20,7 @@ from edge.identity.envelope import (
     Envelope,
     Head,
     enclose,
+    is_of_other_version,
     read_envelope,
     seal,
 )
@@ -112,6 +113,8 @@ class _Heard:
 class Guard(Protocol):
     """Interface through which a node speaks and hears."""
 
+    release: bytes
+
     @property
     def role(self) -> Role | None:
         """Role that it speaks in; None where messages are not signed."""
@@ -140,11 +143,31 @@ class Guard(Protocol):
     def robots_ahead(self) -> frozenset[int]:
         """Robots that number their starts further ahead of the clock than one can be wrong."""
 
+    def take_strangers(self) -> set[int]:
+        """Robots that sent envelopes of another version since this was called last."""
+
     def hear_time(self, unix_s: float) -> None:
         """It is at least so late; robots whose start lies more than a day ahead are not heard."""
 
     def refused(self) -> dict[str, int]:
         """How many messages were nobody's, by why."""
+
+
+class _Strangers:
+    """Robots that send envelopes of another version; nobody knows whether it is they."""
+
+    def __init__(self) -> None:
+        self._robots: set[int] = set()
+
+    def note(self, key: str, data: bytes) -> None:
+        """An envelope came on that key which cannot be read."""
+        if is_of_other_version(data) and key.startswith("robot/"):
+            self._robots.add(int(key.split("/")[1]))
+
+    def take(self) -> set[int]:
+        """Those since this was called last."""
+        robots, self._robots = self._robots, set()
+        return robots
 
 
 class Unguarded:
@@ -154,8 +177,10 @@ class Unguarded:
     which were smaller.
     """
 
-    def __init__(self, start: int) -> None:
+    def __init__(self, start: int, release: bytes = RELEASE) -> None:
+        self.release = release
         self._start = start
+        self._strangers = _Strangers()
         self._lock = Lock()
         self._sequences: Counter[Topic] = Counter()
         self._refused = 0
@@ -177,11 +202,12 @@ class Unguarded:
         with self._lock:
             self._sequences[topic] += 1
             sequence = self._sequences[topic]
-        return enclose(payload, MessageNumber(self._start, sequence))
+        return enclose(payload, MessageNumber(self._start, sequence), release=self.release)
 
     def _receive(self, hear: Hear, key: str, data: bytes) -> bool:
         envelope = read_envelope(data)
         if envelope is None or envelope.head.is_signed:
+            self._strangers.note(key, data)
             self._refused += 1
             return False
         role = Role.ROBOT if key.startswith("robot/") else Role.OPERATOR
@@ -207,6 +233,10 @@ class Unguarded:
     def robots_ahead(self) -> frozenset[int]:
         """See `Guard`."""
         return frozenset()
+
+    def take_strangers(self) -> set[int]:
+        """See `Guard`."""
+        return self._strangers.take()
 
     def hear_time(self, unix_s: float) -> None:
         """See `Guard`."""
@@ -236,11 +266,15 @@ class SignedGuard:
     `members` is the list that counts now: whoever is not in it is not heard.
     """
 
-    def __init__(self, membership: Membership, clock_s: Callable[[], float]) -> None:
+    def __init__(
+        self, membership: Membership, clock_s: Callable[[], float], release: bytes = RELEASE
+    ) -> None:
         self.members = membership.members
+        self.release = release
         self._own = membership.own
         self._signer = membership.signer
         self._start = membership.start
+        self._strangers = _Strangers()
         self._clock_s = clock_s
         self._lock = Lock()
         # Robots of an earlier list that are in the list no more.
@@ -323,6 +357,10 @@ class SignedGuard:
         found = (self.members.by_key.get(fingerprint) for fingerprint in fingerprints)
         return frozenset(m.robot_id for m in found if m and m.robot_id is not None)
 
+    def take_strangers(self) -> set[int]:
+        """See `Guard`."""
+        return self._strangers.take()
+
     def hear_time(self, unix_s: float) -> None:
         """See `Guard`."""
         offset_s = unix_s - self._clock_s()
@@ -366,6 +404,7 @@ class SignedGuard:
             address=Address(self.members.authority, key),
             number=MessageNumber(self._start, sequence),
             members=self.members.digest,
+            release=self.release,
         )
 
     # What comes in
@@ -383,6 +422,7 @@ class SignedGuard:
     ) -> tuple[bytes, Speaker] | RefusedMessage:
         envelope = read_envelope(data)
         if envelope is None:
+            self._strangers.note(key, data)
             return RefusedMessage.NO_ENVELOPE
         sender = self.members.by_key.get(envelope.head.fingerprint)
         if sender is None:

@@ -1,4 +1,4 @@
-"""Beacon: header of everything that a robot says to robots.
+"""Beacon: header of everything that a robot says to robots, the same in every release.
 
 Behind it is what the robot's policy says (`edge.core.wire`); while the policy is silent, nothing.
 Who says it, which start of its program, and the message's number are in the envelope. So neighbours
@@ -89,6 +89,7 @@ class Beacon:
 
     `sent` is when, None as long as the sender does not know the time. `bundle_tag` and `world_tag`
     are the `tag`s of what it flies by; `frame_id` is 0 as long as it has no mission origin.
+    `other_release` is its release, by the envelope, "" if it is the own one.
     """
 
     robot_id: int
@@ -105,6 +106,7 @@ class Beacon:
     flown_s: float | None = None
     slot_height_m: float = 0.0
     landing_point_m: tuple[float, float] = (0.0, 0.0)
+    other_release: str = ""
 
 
 class HeardBeacon(NamedTuple):
@@ -160,16 +162,16 @@ def encode_beacon(beacon: Beacon) -> bytes:
     return _STRUCT.pack(*map(_packed, _FIELDS.values(), values))
 
 
-def decode_beacon(data: bytes | memoryview, robot_id: int) -> Beacon:
+def decode_beacon(data: bytes | memoryview, robot_id: int, other_release: str = "") -> Beacon:
     """The robot's beacon at the start of `data`. Raises MessageError."""
     if len(data) < BEACON_BYTES:
         raise MessageError(f"Beacon: {len(data)} bytes: must be {BEACON_BYTES}")
-    return _decoded(bytes(data[:BEACON_BYTES]), robot_id)
+    return _decoded(bytes(data[:BEACON_BYTES]), robot_id, other_release)
 
 
 # The robots of one process, as in a simulator, hear the same bytes within a moment.
 @functools.lru_cache(maxsize=8)
-def _decoded(body: bytes, robot_id: int) -> Beacon:
+def _decoded(body: bytes, robot_id: int, other_release: str) -> Beacon:
     values = []
     for (name, number), packed in zip(_FIELDS.items(), _STRUCT.unpack(body), strict=True):
         value = packed / number.steps if number.steps > 1 else packed
@@ -199,6 +201,7 @@ def _decoded(body: bytes, robot_id: int) -> Beacon:
         flown_s=None if flown_s == _UNKNOWN else float(flown_s),
         slot_height_m=slot_height_m,
         landing_point_m=(landing_x_m, landing_y_m),
+        other_release=other_release,
     )
 
 

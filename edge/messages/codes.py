@@ -68,7 +68,7 @@ class CheckCode(_Code):
     FENCE_OUT_OF_REACH = "fence_out_of_reach"
     # The other robots.
     DUPLICATE_ID = "duplicate_id"
-    NOT_UNDERSTOOD = "not_understood"
+    OTHER_RELEASE = "other_release"
     OTHER_NOT_HEARD = "other_not_heard"
     SAME_SYSTEM_ID = "same_system_id"
     OTHER_BUNDLE = "other_bundle"
@@ -216,6 +216,7 @@ class RefusalCode(_Code):
 
     OTHER = "other"
     NOT_UNDERSTOOD = "not_understood"
+    OTHER_RELEASE = "other_release"
     OTHER_START = "other_start"
     EXPIRED = "expired"
     VALID_TOO_LONG = "valid_too_long"

@@ -47,8 +47,6 @@ from edge.messages.bounds import (
 )
 from edge.messages.codes import FailedCheck, Reason, ReasonCode, Refusal
 
-# Of what is said now. A message of another version is taken as far as it can be; see the codec.
-VERSION = 3
 ORDER_LIFETIME_S = 10.0
 # Stations repeat a hold five times a second.
 HOLD_LASTS_S = 1.5
@@ -58,9 +56,6 @@ SlotNumber = Annotated[int, Meta(ge=0, le=1000)]
 AT_SLOT_M = 1.0
 _OVER_LANDING_POINT_M = 1.5
 
-Version = Annotated[int, Meta(ge=0, le=10_000)]
-# What an older program must know of, or else refuse the message: names of fields.
-MustUnderstand = Annotated[tuple[Name, ...], Meta(max_length=20)]
 FailedChecks = Annotated[tuple[FailedCheck, ...], Meta(max_length=MOST_TEXTS)]
 _Point = Annotated[tuple[Metres, ...], Meta(min_length=2, max_length=2, description="[x, y]")]
 Vector = tuple[Metres, Metres, Metres]
@@ -132,7 +127,23 @@ class Echo:
 
 
 @dataclass(frozen=True, slots=True)
-class GroundState:
+class SafetyRequest:
+    """The part of a `GroundState` by which robots hold and land, even if they refuse the rest."""
+
+    sequence: Sequence
+    operator: Name
+    safety_action: SafetyAction = field(default="none", kw_only=True)
+    robot_safety_actions: Annotated[dict[RobotKey, SafetyAction], _OfRobots] = field(
+        default_factory=dict, kw_only=True
+    )
+
+    def safety_action_for(self, robot_id: int) -> SafetyAction:
+        """Safety action that is asked of one robot."""
+        return self.robot_safety_actions.get(str(robot_id), self.safety_action)
+
+
+@dataclass(frozen=True, slots=True)
+class GroundState(SafetyRequest):
     """The ground's wishes for as long as it repeats them; `sequence` grows with every change.
 
     `operator` is who commands; of two states with one sequence the greater operator's counts.
@@ -148,16 +159,10 @@ class GroundState:
     free: nobody asked them to.
     """
 
-    sequence: Sequence
-    operator: Name
     origin: Origin | None = None
     enabled: bool = False
     robot_enabled: Annotated[dict[RobotKey, bool], _OfRobots] = field(default_factory=dict)
-    safety_action: SafetyAction = "none"
     safety_action_by: Name = ""
-    robot_safety_actions: Annotated[dict[RobotKey, SafetyAction], _OfRobots] = field(
-        default_factory=dict
-    )
     fence: Fence | None = None
     places: Annotated[dict[RobotKey, Place], _OfRobots] = field(default_factory=dict)
     world_id: Name | None = None
@@ -167,16 +172,10 @@ class GroundState:
     time_base: TimeBase = 0
     time_s: Seconds | None = None
     echoes: Annotated[dict[RobotKey, Echo], _OfRobots] = field(default_factory=dict)
-    version: Version = VERSION
-    must_understand: MustUnderstand = ()
 
     def enabled_for(self, robot_id: int) -> bool:
         """Whether one robot may run its checks and fly."""
         return self.robot_enabled.get(str(robot_id), self.enabled)
-
-    def safety_action_for(self, robot_id: int) -> SafetyAction:
-        """Safety action that is asked of one robot."""
-        return self.robot_safety_actions.get(str(robot_id), self.safety_action)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,18 +189,17 @@ class Order:
     then "" until it starts again.
 
     `pilot` gives the vehicle, which holds, to a human; `rejoin` takes it back. `disarm` stops the
-    motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone.
+    motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone. `kind` is
+    an `OrderKind`; a robot refuses any other.
     """
 
     order_id: Name
     robot_id: RobotId
     boot_nonce: Nonce
-    kind: OrderKind
+    kind: Name
     expires_at_uptime_s: Seconds
     operator: Name
     trial: Name = ""
-    version: Version = VERSION
-    must_understand: MustUnderstand = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,35 +215,6 @@ class Hold:
     def is_of(self, robot_id: int) -> bool:
         """Whether that robot is to hold."""
         return not self.robots or robot_id in self.robots
-
-
-@dataclass(frozen=True, slots=True)
-class SafetyForm:
-    """The part of a `GroundState` that every version of this program obeys: hold and land.
-
-    It never changes. Who cannot understand the rest of a state still takes this.
-    """
-
-    sequence: Sequence
-    operator: Name
-    safety_action: Name
-    robot_safety_actions: Annotated[dict[RobotKey, Name], _OfRobots]
-
-
-@dataclass(frozen=True, slots=True)
-class OrderForm:
-    """The part of an `Order` that never changes.
-
-    Who cannot understand the rest of an order obeys it by this if its kind is kill, and else
-    refuses it.
-    """
-
-    order_id: Name
-    robot_id: RobotId
-    boot_nonce: Nonce
-    kind: Name
-    expires_at_uptime_s: Seconds
-    operator: Name
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +327,6 @@ class RobotStatus:
     endurance_s: Seconds | None = None
     flown_s: Seconds | None = None
     radio_counts: RadioCounts | None = None
-    version: Version = VERSION
 
     def __post_init__(self) -> None:
         for name, fault in faults(self, _numbers_of_status()).items():
@@ -375,7 +343,7 @@ class RobotStatus:
 
 _NEVER_NONE = (
     "robot_id", "boot_nonce", "sequence", "uptime_s", "unix_time_s", "obeyed_sequence",
-    "slot_height_m", "landing_point_m", "version",
+    "slot_height_m", "landing_point_m",
 )  # fmt: skip
 
 

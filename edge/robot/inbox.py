@@ -10,6 +10,7 @@ from dataclasses import replace
 from threading import Lock
 from typing import NamedTuple
 
+from edge.identity.envelope import RELEASE
 from edge.identity.guard import Speaker
 from edge.identity.members import Role
 from edge.messages.codec import MessageError, decode
@@ -18,9 +19,8 @@ from edge.messages.mission import (
     GroundState,
     Hold,
     Order,
-    OrderForm,
     SafetyAction,
-    SafetyForm,
+    SafetyRequest,
 )
 from edge.robot.neighbours import BEACON_LASTS_S, NeighbourTable
 
@@ -48,7 +48,7 @@ class _HeardByGround(NamedTuple):
 class Inbox:
     """`put_*` may be called from any thread, each other method from one thread."""
 
-    def __init__(self, robot_id: int, ground_timeout_s: float) -> None:
+    def __init__(self, robot_id: int, ground_timeout_s: float, release: bytes = RELEASE) -> None:
         """Of several grounds' states the one with the greatest (sequence, operator) counts.
 
         A smaller one does once no other came for the timeout. A hold of another station, or of an
@@ -56,6 +56,9 @@ class Inbox:
         """
         self._robot_id = robot_id
         self._ground_timeout_s = ground_timeout_s
+        self._release = release
+        # Of the ground whose state counts; "" if it is this robot's own.
+        self.other_release = ""
         self._lock = Lock()
         self._grounds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
         self._orders: deque[_Arrived] = deque(maxlen=_MOST_ORDERS)
@@ -66,8 +69,8 @@ class Inbox:
         self._holds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
         self._held_by = ""
         self._held_at_s = -math.inf
-        self._safety_form: SafetyAction = "none"
-        self._safety_form_at_s = -math.inf
+        self._refused_asks: SafetyAction = "none"
+        self._refused_at_s = -math.inf
         # Why the newest state of a ground was not understood; "" if it was.
         self.ground_refusal = ""
         # The text of the newest world file that the ground sent.
@@ -106,12 +109,13 @@ class Inbox:
             except MessageError as error:
                 self.not_understood_count += 1
                 self.ground_refusal = str(error)
-                self._take_safety_form(arrived)
+                self._take_safety_request(arrived)
                 continue
             if _is_own(state.operator, arrived.speaker) and self._counts(state, arrived.at_s):
                 self._ground, self._ground_at_s = state, arrived.at_s
                 self._put_echoes(state, arrived.at_s)
-                self._safety_form, self.ground_refusal = "none", ""
+                self._refused_asks, self.ground_refusal = "none", ""
+                self._note_release(arrived.speaker)
         return self._with_asked_hold(now_s), now_s - self._ground_at_s
 
     def _put_echoes(self, state: GroundState, at_s: float) -> None:
@@ -145,27 +149,29 @@ class Inbox:
             safety_action_by=self._held_by,
         )
 
-    def safety_form(self, now_s: float) -> SafetyAction:
-        """Request of a ground whose states are not understood: hold, land, or none. Control thread.
+    def safety_request(self, now_s: float) -> SafetyAction:
+        """Request of a ground whose states are refused: hold, land, or none. Control thread.
 
         The last state that was understood stays, and its age grows.
         """
-        fresh = now_s - self._safety_form_at_s <= self._ground_timeout_s
-        return self._safety_form if fresh else "none"
+        fresh = now_s - self._refused_at_s <= self._ground_timeout_s
+        return self._refused_asks if fresh else "none"
 
-    def _take_safety_form(self, arrived: _Arrived) -> None:
+    def _take_safety_request(self, arrived: _Arrived) -> None:
         try:
-            form = decode(SafetyForm, arrived.data)
+            request = decode(SafetyRequest, arrived.data)
         except MessageError:
             return
-        if not (_is_own(form.operator, arrived.speaker) and self._counts(form, arrived.at_s)):
-            return
-        asked = form.robot_safety_actions.get(str(self._robot_id), form.safety_action)
-        known: dict[str, SafetyAction] = {"hold": "hold", "land": "land"}
-        self._safety_form = known.get(asked, "none")
-        self._safety_form_at_s = arrived.at_s
+        if _is_own(request.operator, arrived.speaker) and self._counts(request, arrived.at_s):
+            asked = request.safety_action_for(self._robot_id)
+            self._refused_asks = asked if asked in ("hold", "land") else "none"
+            self._refused_at_s = arrived.at_s
+            self._note_release(arrived.speaker)
 
-    def _counts(self, state: GroundState | SafetyForm, at_s: float) -> bool:
+    def _note_release(self, speaker: Speaker) -> None:
+        self.other_release = "" if speaker.release == self._release else speaker.release.hex()
+
+    def _counts(self, state: SafetyRequest, at_s: float) -> bool:
         newest = self._ground
         if newest is None or at_s - self._ground_at_s > self._ground_timeout_s:
             return True
@@ -182,34 +188,21 @@ class Inbox:
             return None
         return ground.unix_time_s + now_s - at_s
 
-    def order(self, now_s: float) -> Order | OrderForm | None:
+    def order(self, now_s: float) -> Order | None:
         """The next order for this robot, if one has come by then. Control thread.
 
-        Of one that is not understood, to be refused, there is the form; to kill is understood.
         What came since was made by a later uptime than the tick's, and would seem valid too long.
         """
         while self._orders and self._orders[0].at_s <= now_s:
             data, speaker, _ = self._orders.popleft()
-            order = self._order(data)
-            if order and order.robot_id == self._robot_id and _is_own(order.operator, speaker):
+            try:
+                order = decode(Order, data)
+            except MessageError:
+                self.not_understood_count += 1
+                continue
+            if order.robot_id == self._robot_id and _is_own(order.operator, speaker):
                 return order
         return None
-
-    def _order(self, data: bytes) -> Order | OrderForm | None:
-        try:
-            return decode(Order, data)
-        except MessageError:
-            self.not_understood_count += 1
-        try:
-            form = decode(OrderForm, data)
-        except MessageError:
-            return None
-        if form.kind != "kill":
-            return form
-        return Order(
-            form.order_id, form.robot_id, form.boot_nonce, "kill",
-            form.expires_at_uptime_s, form.operator,
-        )  # fmt: skip
 
     def strangers(self, now_s: float) -> tuple[str, ...]:
         """Robots that said lately what could not be read."""

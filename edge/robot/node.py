@@ -114,7 +114,7 @@ class RobotNode:
         self._link: Link | None = None
         # What it knows: its place, the ground's mail, its map and its neighbours.
         self._navigation = Navigation(ports.vehicle, clock.monotonic_s, config.position)
-        self._inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
+        self._inbox = Inbox(config.robot_id, config.flight.ground_timeout_s, guard.release)
         self._pac = Pac(
             robot_id=config.robot_id,
             policy=policy.policy,
@@ -196,7 +196,8 @@ class RobotNode:
         sender = int(key.split("/")[1])
         rejection = age_s = None
         try:
-            beacon = decode_beacon(data, sender)
+            release = "" if speaker.release == self._guard.release else speaker.release.hex()
+            beacon = decode_beacon(data, sender, release)
         except MessageError:
             self._inbox.put_stranger(f"robot {sender}", now_s)
         else:
@@ -309,6 +310,8 @@ class RobotNode:
         ground_unix_s = self._inbox.ground_unix_s(now_s)
         if ground_unix_s is not None:
             self._guard.hear_time(max(ground_unix_s, self._ports.clock.unix_s()))
+        for robot_id in self._guard.take_strangers():
+            self._inbox.put_stranger(f"robot {robot_id}", now_s)
         time = self._pac.clock.at(now_s)
         control.checks = self.readiness.checks(
             now_s,
@@ -316,7 +319,8 @@ class RobotNode:
             position=self._navigation.position,
             odometry=self._navigation.odometry(),
             peers=self._pac.table.heard(now_s, BEACON_LASTS_S),
-            not_understood=self._inbox.strangers(now_s),
+            strangers=self._inbox.strangers(now_s),
+            ground_release=self._inbox.other_release,
             unheard=self._inbox.unheard(now_s, self._pac.table),
             fell_silent=control.fell_silent,
             duplicate=self._is_duplicate(),

@@ -203,6 +203,8 @@ class Pac:
         message: AggregatedMessage | Rejection | None
         if not data:
             message = None
+        elif beacon.other_release:
+            message = Rejection.OTHER_RELEASE
         elif beacon.bundle_tag != self._bundle_tag:
             message = Rejection.OTHER_BUNDLE
         elif beacon.frame_id != self.frame_id or beacon.position_m is None:

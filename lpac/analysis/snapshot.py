@@ -66,7 +66,7 @@ class RobotSnapshot:
     `age_s` is the status's age, `clock_offset_s` how far the robot's clock is ahead of this one.
     `rates_hz` are the rates of messages from each neighbour (robot id as text) over the last few
     seconds, `arrivals` their counts by fate in the last ten (`Arrivals.counts`). `duplicate`: two
-    programs use this robot's id.
+    programs use this robot's id. `other_release` is its release, "" if it is the ground's.
     """
 
     name: str
@@ -77,6 +77,7 @@ class RobotSnapshot:
     rates_hz: dict[str, float] = field(default_factory=dict)
     arrivals: dict[str, tuple[int, ...]] = field(default_factory=dict)
     duplicate: bool = False
+    other_release: str = ""
 
     @property
     def fresh(self) -> bool:

@@ -68,6 +68,7 @@ class AlarmCode(StrEnum):
     OWN = "own"
     NOT_OBEYED = "not_obeyed"
     BATTERY = "battery"
+    OTHER_RELEASE = "other_release"
     OTHER_BUNDLE = "other_bundle"
     OTHER_WORLD = "other_world"
     OTHER_ORIGIN = "other_origin"
@@ -261,6 +262,14 @@ def _duplicate(fleet: _Fleet, seen: _Seen) -> _Found:
     return "critical", "two programs say that they are this robot: end one, or revoke its key"
 
 
+def _release(fleet: _Fleet, seen: _Seen) -> _Found:
+    release = seen.robot.other_release
+    if not release:
+        return None
+    text = f"flies another release ({release}) than this ground station: deploy one to all"
+    return "critical" if is_flying(seen.status) else "warning", text
+
+
 def _own(fleet: _Fleet, seen: _Seen) -> _Found:
     status = seen.status
     if not status.alarms:
@@ -416,6 +425,7 @@ _CHECKS: Mapping[AlarmCode, Callable[[_Fleet, _Seen], _Found]] = {
     AlarmCode.OWN: _own,
     AlarmCode.NOT_OBEYED: _not_obeyed,
     AlarmCode.BATTERY: _battery,
+    AlarmCode.OTHER_RELEASE: _release,
     AlarmCode.OTHER_BUNDLE: _bundle,
     AlarmCode.OTHER_WORLD: _world,
     AlarmCode.OTHER_ORIGIN: _origin,

@@ -94,7 +94,7 @@ def flown() -> list[tuple[object, ...]]:
 
     for change in (
         {"position_known": False}, {"battery": 0.24}, {"battery": 0.1}, {"ground_on": False},
-        {"policy_m_s": None}, {"telemetry": False}, {"busy": (4,)}, {"safety_form": "hold"},
+        {"policy_m_s": None}, {"telemetry": False}, {"busy": (4,)}, {"safety_request": "hold"},
         {"not_taken": (FailedCheck(CheckCode.KEEPS_FENCE, "in flight: keeps its fence"),)},
         {"failed_checks": (FailedCheck(CheckCode.GPS_NO_FIX, "no fix"),)},
     ):  # fmt: skip

@@ -70,6 +70,7 @@ class _Robot:
         self.robot_id = robot_id
         self.present = False
         self.duplicate = False
+        self.other_release = ""
         self._programs: dict[int, _ProgramStart] = {}
         self._nonce: int | None = None
 
@@ -123,6 +124,7 @@ class _Robot:
             rates_hz=_rates_hz(recent[0].status, newest),
             arrivals=program.arrivals,
             duplicate=self.duplicate,
+            other_release=self.other_release,
         )
 
 
@@ -145,7 +147,7 @@ class HeardRobots:
         """How long they have been listened to, s."""
         return self.now_s - self._began_s
 
-    def hear(self, status: RobotStatus) -> bool:
+    def hear(self, status: RobotStatus, other_release: str = "") -> bool:
         """Whether that is a newer status of a robot's program than was known.
 
         It is not if the robot is of no name here, or if another program is that robot.
@@ -156,6 +158,7 @@ class HeardRobots:
         before = None if robot.program is None else robot.program.newest.status
         if not robot.take(_HeardStatus(self.now_s, status.unix_time_s - self.unix_now_s, status)):
             return False
+        robot.other_release = other_release
         if before is not None and before.boot_nonce != status.boot_nonce:
             self._tell("presence", robot.name, "its program has started again")
         if before is None or (before.state, before.reason) != (status.state, status.reason):

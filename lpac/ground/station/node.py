@@ -40,6 +40,7 @@ _AHEAD = (
     "clock is behind, or the robot's was wrong (`lpac fleet up`, then `lpac fleet restart`), or "
     "somebody has its key (`lpac fleet revoke`)"
 )
+_STRANGER = "flies another release, which this ground station cannot read: deploy one to all"
 # Ticks are not exact.
 _EARLY_S = 0.1
 
@@ -124,6 +125,9 @@ class GroundNode:
         for robot_id in self._guard.robots_ahead():
             name = self._names.get(f"robot/{robot_id}", "")
             self._complain(f"ahead {robot_id}", name, _AHEAD)
+        for robot_id in self._guard.take_strangers():
+            name = self._names.get(f"robot/{robot_id}", "")
+            self._complain(f"stranger {robot_id}", name, _STRANGER)
         with self.surviving("tick"):
             self.station.tick()
             self._step()
@@ -172,7 +176,8 @@ class GroundNode:
                 if source != f"robot/{status.robot_id}":
                     said = self._names.get(f"robot/{status.robot_id}", f"robot {status.robot_id}")
                     raise MessageError(f"it says that it is {said}")
-                self.station.hear_status(status)
+                is_own = speaker.release == self._guard.release
+                self.station.hear_status(status, "" if is_own else speaker.release.hex())
         except MessageError as error:
             # Another version of the program, say.
             self._complain(key, name or "", f"{topic} is not understood: {error}")

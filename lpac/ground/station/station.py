@@ -182,9 +182,9 @@ class Station:
         """These robots' keys speak twice now, by robot id."""
         self._robots.said_twice = robots
 
-    def hear_status(self, status: RobotStatus) -> None:
+    def hear_status(self, status: RobotStatus, other_release: str = "") -> None:
         """A robot's status came. One that is not of this fleet is nobody's."""
-        if self._robots.hear(status):
+        if self._robots.hear(status, other_release):
             self.worlds.hear_status(status)
             self.orders.hear(status)
             self.election.hear_status(status)

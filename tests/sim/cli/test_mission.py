@@ -17,7 +17,7 @@ import pytest
 
 from edge.identity.envelope import HEAD_BYTES
 from edge.messages.codec import decode
-from edge.messages.mission import FlightState, Order, OrderKind
+from edge.messages.mission import FlightState, Order
 from edge.messages.topics import ORDER
 from lpac.ground.procedure import Procedure, Until
 from lpac.ground.station.protocol import (
@@ -578,7 +578,7 @@ def test_script_ends_with_the_step_that_fails_and_holds_the_fleet(field: Command
 
 
 def test_hold_is_the_operators_also_while_the_script_starts_a_robot(field: Commanded) -> None:
-    kinds: list[OrderKind] = []
+    kinds: list[str] = []
 
     def heard(order: Order) -> bool:
         """Its policy falls silent once it is taken back, so that it does not start again."""

@@ -315,7 +315,7 @@ def test_a_landing_that_px4s_own_failsafe_interrupts_is_not_let_go_of() -> None:
             now_s=now_s, vehicle=vehicle, position=judgement, odometry=None,
             policy_velocity_m_s=None, neighbours=(), closest=None, busy_neighbours=(), ground=None,
             ground_age_s=math.inf,
-            safety_form="none", failed_checks=None, not_taken=(), order=None, uptime_s=now_s,
+            safety_request="none", failed_checks=None, not_taken=(), order=None, uptime_s=now_s,
             energy=None,
         )  # fmt: skip
         flight, actions, alarms, _, _ = step(robot, flight, inputs)

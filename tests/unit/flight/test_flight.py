@@ -66,7 +66,6 @@ from edge.messages.mission import (
     FlightState,
     GroundState,
     Order,
-    OrderForm,
     OrderKind,
     OrderResult,
     Origin,
@@ -120,6 +119,7 @@ class World:
     """
 
     repeats = 0
+    other_release = ""
 
     def __init__(
         self, phase_s: float = 0.35, latency_s: float = 0.1, *, flown_again: bool = False
@@ -169,8 +169,8 @@ class World:
         self.busy: tuple[int, ...] = ()
         self.failed_checks: tuple[FailedCheck, ...] | None = ()
         self.not_taken: tuple[FailedCheck, ...] = ()
-        self.safety_form: SafetyAction = "none"
-        self.order: Order | OrderForm | None = None
+        self.safety_request: SafetyAction = "none"
+        self.order: Order | None = None
         self.orders = 0
         # The program, and what it did.
         self.restart()
@@ -230,7 +230,7 @@ class World:
         expires_s = self.now_s - self.started_s + 9.0
         return Order(f"o{self.orders}", ROBOT.robot_id, 77, kind, expires_s, "op", trial)
 
-    def give(self, order: Order | OrderForm) -> OrderResult:
+    def give(self, order: Order) -> OrderResult:
         self.order = order
         self.tick()
         self.order = None
@@ -438,7 +438,8 @@ class World:
             busy_neighbours=self.busy,
             ground=self.ground,
             ground_age_s=self.now_s - self.ground_at_s,
-            safety_form=self.safety_form,
+            safety_request=self.safety_request,
+            other_release=self.other_release,
             failed_checks=self.failed_checks,
             not_taken=self.not_taken,
             order=self.order,
@@ -661,14 +662,14 @@ def test_orders_are_refused_with_the_reason(world: World) -> None:
         world.reads(answer.refusal, "would be valid for ")
     answer = world.give(replace(world.new_order("takeoff"), boot_nonce=1))
     assert why(answer) is RefusalCode.OTHER_START
-    order = world.new_order("takeoff")
-    form = OrderForm(
-        "new", order.robot_id, order.boot_nonce, "dock", order.expires_at_uptime_s, "op"
-    )
-    answer = world.give(form)
+    answer = world.give(replace(world.new_order("takeoff"), kind="dock"))
     assert why(answer) is RefusalCode.NOT_UNDERSTOOD
     world.reads(answer.refusal, "this program does not understand dock")
     assert world.state() is FlightState.PREFLIGHT
+    world.other_release = "01020304"
+    assert world.refuse("takeoff") is RefusalCode.OTHER_RELEASE
+    world.reads(world.said, "the ground flies another release (01020304) than this robot")
+    world.other_release = ""
     world.enable(safety_action="hold")
     assert world.refuse("takeoff") is RefusalCode.GROUND_COMMANDS
     world.reads(world.said, "the ground commands hold")

@@ -69,7 +69,7 @@ def inputs(
         busy_neighbours=(),
         ground=None,
         ground_age_s=0.0,
-        safety_form="none",
+        safety_request="none",
         failed_checks=(),
         not_taken=(),
         order=None,

@@ -83,7 +83,8 @@ READY = PreflightInputs(
     min_separation_m=2.0,
     errors=ErrorBudget(),
     neighbours=(HeardBeacon(NEIGHBOUR, 99.8, 99.8),),
-    not_understood=(),
+    strangers=(),
+    ground_release="",
     unheard=(),
     fell_silent=(),
     separation=SeparationLimits(
@@ -134,9 +135,23 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         "the ground hears robot 4, and this robot does not: they would not keep apart",
     ),
     (
-        {"not_understood": ("robot 4",)},
-        _C.NOT_UNDERSTOOD,
-        "robot 4 runs another version of this program",
+        {"strangers": ("robot 4",)},
+        _C.OTHER_RELEASE,
+        "robot 4 flies another release (not readable) than this robot: deploy one to all",
+    ),
+    (
+        {"ground_release": "01020304"},
+        _C.OTHER_RELEASE,
+        "the ground flies another release (01020304) than this robot",
+    ),
+    (
+        {
+            "neighbours": (
+                HeardBeacon(dataclasses.replace(NEIGHBOUR, other_release="01020304"), 99.8, 99.8),
+            )
+        },
+        _C.OTHER_RELEASE,
+        "robot 2 flies another release (01020304) than this robot",
     ),
     (
         {"failsafe_problems": None},

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from edge.identity.guard import Speaker
 from edge.identity.members import Role
 from edge.messages.codec import encode
-from edge.messages.mission import Echo, GroundState, Hold, Order, OrderForm, Origin
+from edge.messages.mission import Echo, GroundState, Hold, Order, Origin
 from edge.robot.inbox import Inbox
 from edge.robot.neighbours import NeighbourTable
 from tests.unit.flight.test_preflight import NEIGHBOUR
@@ -124,9 +124,8 @@ def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
 
 
 def newer(message: GroundState | Order, **changes: object) -> bytes:
-    """As a later version says it, which has something that must be understood."""
-    told = json.loads(encode(message))
-    return json.dumps(told | {"version": 9, "must_understand": ["new"]} | changes).encode()
+    """As another release says it, of which something is out of bounds here."""
+    return json.dumps(json.loads(encode(message)) | {"world_id": 7} | changes).encode()
 
 
 def test_a_state_that_is_not_understood_holds_and_lands_and_ages_the_last_one() -> None:
@@ -137,16 +136,16 @@ def test_a_state_that_is_not_understood_holds_and_lands_and_ages_the_last_one() 
         inbox.put_ground(newer(STATE, sequence=6, safety_action=action), ANYBODY, now_s)
         # The last one that was understood stays, and ground lost counts on.
         assert inbox.ground(now_s) == (STATE, now_s - 1.0)
-        assert inbox.safety_form(now_s) == form
-        assert "new: this program is too old to know" in inbox.ground_refusal
-    assert inbox.safety_form(7.6) == "none"
+        assert inbox.safety_request(now_s) == form
+        assert "world_id = 7" in inbox.ground_refusal
+    assert inbox.safety_request(7.6) == "none"
     inbox.put_ground(newer(STATE, robot_safety_actions={"3": "hold", "4": "land"}), ANYBODY, 8.0)
     inbox.ground(8.0)
-    assert inbox.safety_form(8.0) == "hold"
+    assert inbox.safety_request(8.0) == "hold"
     again = dataclasses.replace(STATE, sequence=7)
     inbox.put_ground(encode(again), ANYBODY, 8.5)
     assert inbox.ground(8.5) == (again, 0.0)
-    assert (inbox.safety_form(8.5), inbox.ground_refusal) == ("none", "")
+    assert (inbox.safety_request(8.5), inbox.ground_refusal) == ("none", "")
 
 
 def test_an_older_state_that_is_not_understood_commands_nothing() -> None:
@@ -155,21 +154,32 @@ def test_an_older_state_that_is_not_understood_commands_nothing() -> None:
     inbox.ground(1.0)
     inbox.put_ground(newer(STATE, sequence=4, safety_action="land"), ANYBODY, 1.5)
     inbox.ground(1.5)
-    assert inbox.safety_form(1.5) == "none"
+    assert inbox.safety_request(1.5) == "none"
 
 
-def test_of_orders_that_are_not_understood_only_kill_is_obeyed() -> None:
+def test_of_another_release_an_order_is_taken_as_far_as_it_is_understood() -> None:
     inbox = make_inbox()
-    for said in (newer(ORDER), newer(ORDER, kind="dock")):
-        inbox.put_order(said, ANYBODY, 0.0)
-        assert isinstance(inbox.order(0.0), OrderForm)  # to be refused
-    inbox.put_order(newer(ORDER, robot_id=2), ANYBODY, 0.0)
-    assert inbox.order(0.0) is None
-    inbox.put_order(newer(ORDER, kind="kill"), ANYBODY, 0.0)
-    kill = inbox.order(0.0)
-    assert isinstance(kill, Order)
-    assert (kill.kind, kill.boot_nonce) == ("kill", ORDER.boot_nonce)
-    assert inbox.not_understood_count == 4
+    for kind in ("kill", "dock"):
+        inbox.put_order(newer(ORDER, kind=kind), ANYBODY, 0.0)
+        order = inbox.order(0.0)
+        assert order is not None and (order.kind, order.boot_nonce) == (kind, ORDER.boot_nonce)
+    for data in (newer(ORDER, robot_id=2), newer(ORDER, boot_nonce=-1)):
+        inbox.put_order(data, ANYBODY, 0.0)
+        assert inbox.order(0.0) is None
+    assert inbox.not_understood_count == 1
+
+
+def test_the_grounds_release_is_that_of_the_state_that_counts() -> None:
+    inbox, other = make_inbox(), ANYBODY._replace(release=b"abcd")
+    for now_s, data, speaker, release in (
+        (1.0, encode(STATE), other, "61626364"),
+        (1.5, encode(dataclasses.replace(STATE, sequence=4)), ANYBODY, "61626364"),
+        (2.0, encode(STATE), ANYBODY, ""),
+        (2.5, newer(STATE), other, "61626364"),
+    ):
+        inbox.put_ground(data, speaker, now_s)
+        inbox.ground(now_s)
+        assert inbox.other_release == release
 
 
 def test_who_speaks_another_version_is_named_for_as_long_as_it_does() -> None:
@@ -245,7 +255,7 @@ def test_of_who_does_not_command_only_a_hold_counts() -> None:
             inbox.put_ground(encode(other), speaker, 0.95)
             inbox.put_ground(newer(other), speaker, 0.95)
         assert asked(inbox, 1.0) == ("none", "")
-        assert inbox.safety_form(1.0) == "none"
+        assert inbox.safety_request(1.0) == "none"
     # What the commander asks for goes before.
     inbox = make()
     landing = dataclasses.replace(state, safety_action="land")

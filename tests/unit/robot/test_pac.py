@@ -249,12 +249,13 @@ def test_what_a_robot_must_not_hear_is_counted(shipped_policy: LpacPolicy) -> No
     good = message(shipped_policy)
     cases = {
         Rejection.OWN: message(shipped_policy, robot_id=1),
-        Rejection.OTHER_BUNDLE: message(shipped_policy, bundle_tag=1, sequence=2),
-        Rejection.COMPRESSION: good._replace(number=(1, 3), data=good.data[:20]),
-        Rejection.NON_FINITE: message(shipped_policy, value=float("nan"), sequence=4),
-        Rejection.STALE: message(shipped_policy, sequence=5, sent=FleetTime(GROUND, -1.0, 0.0)),
-        Rejection.AGE_UNKNOWN: message(shipped_policy, sequence=6, sent=None),
-        Rejection.OUTDATED: message(shipped_policy, sequence=6),
+        Rejection.OTHER_RELEASE: message(shipped_policy, other_release="01", sequence=2),
+        Rejection.OTHER_BUNDLE: message(shipped_policy, bundle_tag=1, sequence=3),
+        Rejection.COMPRESSION: good._replace(number=(1, 4), data=good.data[:20]),
+        Rejection.NON_FINITE: message(shipped_policy, value=float("nan"), sequence=5),
+        Rejection.STALE: message(shipped_policy, sequence=6, sent=FleetTime(GROUND, -1.0, 0.0)),
+        Rejection.AGE_UNKNOWN: message(shipped_policy, sequence=7, sent=None),
+        Rejection.OUTDATED: message(shipped_policy, sequence=7),
     }
     assert robot.receive(*good, 0.0) is None
     for reason, said in cases.items():
