@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F32
@@ -146,7 +147,7 @@ class ListeningAutopilot(DirectAutopilot):
             for message in self._parser.parse_buffer(datagram) or ():
                 if message.get_type() in self._telemetry.messages:
                     self._telemetry.hear(message.get_type(), message.to_dict(), now_s)
-        return dataclasses.replace(self._telemetry.state(now_s), system_id=7, result=self.result)
+        return structs.replace(self._telemetry.state(now_s), system_id=7, result=self.result)
 
 
 class Flown:
