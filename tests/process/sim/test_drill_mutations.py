@@ -15,7 +15,7 @@ from edge.core.logger import errors_only
 from edge.flight.orders import ORDERS
 from edge.flight.state import Robot
 from edge.flight.transitions import TRANSITIONS, Transition, by_state
-from edge.identity.guard import SignedGuard
+from edge.identity.news import NOTHING, MessageNumber, Newest
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
 from lpac.ground.station.station import Station
@@ -123,13 +123,16 @@ def ground_tells_nothing_of_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Station, "published_state", without)
 
 
-def cards_tell_nothing_of_a_new_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    overtaken = SignedGuard._overtaken
+def a_program_that_starts_again_is_not_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    is_older = Newest.is_older
 
-    def of_others(self: SignedGuard, key: str, card: Any, envelope: Any) -> Any:
-        return None if key.endswith("/card") else overtaken(self, key, card, envelope)
+    def of_another_start(
+        self: Newest, number: MessageNumber, now_s: float, unix_s: float | None
+    ) -> bool:
+        started_again = self.number is not NOTHING and number.start != self.number.start
+        return started_again or is_older(self, number, now_s, unix_s)
 
-    monkeypatch.setattr(SignedGuard, "_overtaken", of_others)
+    monkeypatch.setattr(Newest, "is_older", of_another_start)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +145,7 @@ def cards_tell_nothing_of_a_new_program(monkeypatch: pytest.MonkeyPatch) -> None
         (landing_points_swapped, "none", PAIR),
         (ground_tells_nothing_of_holds, "held", PAIR),
         (without_brake, "somebody-over-the-pad", PAIR),
-        (cards_tell_nothing_of_a_new_program, "ground-restarts", 4),
+        (a_program_that_starts_again_is_not_heard, "ground-restarts", PAIR),
     ],
     ids=lambda each: getattr(each, "__name__", str(each)),
 )
