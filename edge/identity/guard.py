@@ -4,13 +4,14 @@ Who a message is from is decided here, before anything of it is decoded and what
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from threading import Lock
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from edge.core.logger import log
 from edge.identity.envelope import (
@@ -110,67 +111,103 @@ class _Heard:
             self.twice_s = now_s
 
 
-class Guard(Protocol):
-    """Interface through which a node speaks and hears."""
+class Guard(ABC):
+    """Interface through which a node speaks and hears. From any thread.
 
-    release: bytes
+    What is known of members here is what is known in a fleet without keys: nothing.
+    """
+
+    def __init__(self, release: bytes) -> None:
+        self.release = release
+        self._lock = Lock()
+        self._sequences: Counter[str] = Counter()
+        self._refused: Counter[RefusedMessage] = Counter()
+        self._strangers: set[int] = set()
 
     @property
     def role(self) -> Role | None:
         """Role that it speaks in; None where messages are not signed."""
+        return None
 
     def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
         """Callbacks to open the link with, so that the node hears these topics."""
+        return {topic: partial(self._receive, topic, callback) for topic, callback in hear.items()}
 
     def over(self, link: Link) -> Link:
         """Link for the node to publish on, which passes on to this one."""
+        return _SealingLink(self, link)
 
+    @abstractmethod
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """The payload in this sender's envelope."""
 
     def is_listed(self) -> bool:
         """Whether the list of members has this program's key: else nobody listens to it."""
+        return True
 
     def members_differ(self) -> str:
         """Describe who of those heard lately has another list of members; "" if nobody has."""
+        return ""
 
     def revoked_robots(self) -> frozenset[int]:
         """Robots that are listened to no more, and may still fly."""
+        return frozenset()
 
     def robots_said_twice(self) -> frozenset[int]:
         """Robots whose key two programs have: the own one among them, if it is said elsewhere."""
+        return frozenset()
 
     def robots_ahead(self) -> frozenset[int]:
         """Robots that number their starts further ahead of the clock than one can be wrong."""
+        return frozenset()
+
+    def hear_time(self, unix_s: float) -> None:  # noqa: B027  (an open fleet has no use for it)
+        """It is at least so late; robots whose start lies more than a day ahead are not heard."""
 
     def take_strangers(self) -> set[int]:
         """Robots that sent envelopes of another version since this was called last."""
-
-    def hear_time(self, unix_s: float) -> None:
-        """It is at least so late; robots whose start lies more than a day ahead are not heard."""
+        robots, self._strangers = self._strangers, set()
+        return robots
 
     def refused(self) -> dict[str, int]:
         """How many messages were nobody's, by why."""
+        with self._lock:
+            return {reason.value: count for reason, count in self._refused.items()}
+
+    @abstractmethod
+    def _opened(
+        self, topic: Topic, key: str, envelope: Envelope
+    ) -> tuple[bytes, Speaker] | RefusedMessage:
+        """Payload and sender of a message that came on that key."""
+
+    def _receive(self, topic: Topic, hear: Hear, key: str, data: bytes) -> bool:
+        envelope = read_envelope(data)
+        if envelope is None and is_of_other_version(data) and key.startswith("robot/"):
+            # Nobody knows whether it is they.
+            self._strangers.add(int(key.split("/")[1]))
+        found = (
+            RefusedMessage.NO_ENVELOPE if envelope is None else self._opened(topic, key, envelope)
+        )
+        if isinstance(found, RefusedMessage):
+            self._refuse(found, key)
+            return False
+        hear(key, found[0], found[1])
+        return True
+
+    def _refuse(self, reason: RefusedMessage, key: str) -> None:
+        with self._lock:
+            self._refused[reason] += 1
+            first = self._refused[reason] == 1
+        if first:
+            log.warning("a message is not listened to", why=reason.value, key=key)
+
+    def _next_sequence(self, key: str) -> int:
+        with self._lock:
+            self._sequences[key] += 1
+            return self._sequences[key]
 
 
-class _Strangers:
-    """Robots that send envelopes of another version; nobody knows whether it is they."""
-
-    def __init__(self) -> None:
-        self._robots: set[int] = set()
-
-    def note(self, key: str, data: bytes) -> None:
-        """An envelope came on that key which cannot be read."""
-        if is_of_other_version(data) and key.startswith("robot/"):
-            self._robots.add(int(key.split("/")[1]))
-
-    def take(self) -> set[int]:
-        """Those since this was called last."""
-        robots, self._robots = self._robots, set()
-        return robots
-
-
-class Unguarded:
+class Unguarded(Guard):
     """Messages are not signed, and are taken for those of the keys that they come on.
 
     For a radio that nobody else can reach. `start` tells this start of the program from all before,
@@ -178,72 +215,21 @@ class Unguarded:
     """
 
     def __init__(self, start: int, release: bytes = RELEASE) -> None:
-        self.release = release
+        super().__init__(release)
         self._start = start
-        self._strangers = _Strangers()
-        self._lock = Lock()
-        self._sequences: Counter[Topic] = Counter()
-        self._refused = 0
-
-    @property
-    def role(self) -> None:
-        """See `Guard`."""
-
-    def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
-        """See `Guard`."""
-        return {topic: partial(self._receive, callback) for topic, callback in hear.items()}
-
-    def over(self, link: Link) -> Link:
-        """See `Guard`."""
-        return _SealingLink(self, link)
 
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """See `Guard`."""
-        with self._lock:
-            self._sequences[topic] += 1
-            sequence = self._sequences[topic]
-        return enclose(payload, MessageNumber(self._start, sequence), release=self.release)
+        number = MessageNumber(self._start, self._next_sequence(topic.pattern))
+        return enclose(payload, number, release=self.release)
 
-    def _receive(self, hear: Hear, key: str, data: bytes) -> bool:
-        envelope = read_envelope(data)
-        if envelope is None or envelope.head.is_signed:
-            self._strangers.note(key, data)
-            self._refused += 1
-            return False
+    def _opened(
+        self, topic: Topic, key: str, envelope: Envelope
+    ) -> tuple[bytes, Speaker] | RefusedMessage:
+        if envelope.head.is_signed:
+            return RefusedMessage.NO_ENVELOPE
         role = Role.ROBOT if key.startswith("robot/") else Role.OPERATOR
-        hear(key, envelope.payload, Speaker.of(role, "", envelope.head))
-        return True
-
-    def is_listed(self) -> bool:
-        """See `Guard`."""
-        return True
-
-    def members_differ(self) -> str:
-        """See `Guard`."""
-        return ""
-
-    def revoked_robots(self) -> frozenset[int]:
-        """See `Guard`."""
-        return frozenset()
-
-    def robots_said_twice(self) -> frozenset[int]:
-        """See `Guard`."""
-        return frozenset()
-
-    def robots_ahead(self) -> frozenset[int]:
-        """See `Guard`."""
-        return frozenset()
-
-    def take_strangers(self) -> set[int]:
-        """See `Guard`."""
-        return self._strangers.take()
-
-    def hear_time(self, unix_s: float) -> None:
-        """See `Guard`."""
-
-    def refused(self) -> dict[str, int]:
-        """See `Guard`."""
-        return {RefusedMessage.NO_ENVELOPE.value: self._refused} if self._refused else {}
+        return envelope.payload, Speaker.of(role, "", envelope.head)
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,8 +246,8 @@ class Membership:
     start: int
 
 
-class SignedGuard:
-    """The guard of a member. From any thread.
+class SignedGuard(Guard):
+    """The guard of a member.
 
     `members` is the list that counts now: whoever is not in it is not heard.
     """
@@ -269,14 +255,12 @@ class SignedGuard:
     def __init__(
         self, membership: Membership, clock_s: Callable[[], float], release: bytes = RELEASE
     ) -> None:
+        super().__init__(release)
         self.members = membership.members
-        self.release = release
         self._own = membership.own
         self._signer = membership.signer
         self._start = membership.start
-        self._strangers = _Strangers()
         self._clock_s = clock_s
-        self._lock = Lock()
         # Robots of an earlier list that are in the list no more.
         self._left: frozenset[int] = frozenset()
         self._heard: defaultdict[tuple[bytes, str], _Heard] = defaultdict(_Heard)
@@ -285,8 +269,6 @@ class SignedGuard:
         self._own_said_s = -math.inf
         # The wall clock minus the monotonic one, once it is known.
         self._unix_offset_s: float | None = None
-        self._refused: Counter[RefusedMessage] = Counter()
-        self._sequences: Counter[str] = Counter()
 
     def take(self, members: Members) -> None:
         """Take a newer list, from now on. Raises MembersError if it is none."""
@@ -300,14 +282,6 @@ class SignedGuard:
     def role(self) -> Role:
         """See `Guard`."""
         return self._own.role
-
-    def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
-        """See `Guard`."""
-        return {topic: partial(self._receive, topic, callback) for topic, callback in hear.items()}
-
-    def over(self, link: Link) -> Link:
-        """See `Guard`."""
-        return _SealingLink(self, link)
 
     def is_listed(self) -> bool:
         """See `Guard`."""
@@ -357,21 +331,12 @@ class SignedGuard:
         found = (self.members.by_key.get(fingerprint) for fingerprint in fingerprints)
         return frozenset(m.robot_id for m in found if m and m.robot_id is not None)
 
-    def take_strangers(self) -> set[int]:
-        """See `Guard`."""
-        return self._strangers.take()
-
     def hear_time(self, unix_s: float) -> None:
         """See `Guard`."""
         offset_s = unix_s - self._clock_s()
         # A clock that is set back in flight makes nobody's start too great who was heard before.
         if self._unix_offset_s is None or offset_s > self._unix_offset_s:
             self._unix_offset_s = offset_s
-
-    def refused(self) -> dict[str, int]:
-        """See `Guard`."""
-        with self._lock:
-            return {reason.value: count for reason, count in self._refused.items()}
 
     # At the port, before there is a connection: see `edge.drivers.door`
 
@@ -395,35 +360,20 @@ class SignedGuard:
         return self._seal(_key(self._own, topic), payload)
 
     def _seal(self, key: str, payload: bytes) -> bytes:
-        with self._lock:
-            self._sequences[key] += 1
-            sequence = self._sequences[key]
         return seal(
             payload,
             signer=self._signer,
             address=Address(self.members.authority, key),
-            number=MessageNumber(self._start, sequence),
+            number=MessageNumber(self._start, self._next_sequence(key)),
             members=self.members.digest,
             release=self.release,
         )
 
     # What comes in
 
-    def _receive(self, topic: Topic, hear: Hear, key: str, data: bytes) -> bool:
-        found = self._opened(topic, key, data)
-        if isinstance(found, RefusedMessage):
-            self._refuse(found, key)
-            return False
-        hear(key, found[0], found[1])
-        return True
-
     def _opened(
-        self, topic: Topic, key: str, data: bytes
+        self, topic: Topic, key: str, envelope: Envelope
     ) -> tuple[bytes, Speaker] | RefusedMessage:
-        envelope = read_envelope(data)
-        if envelope is None:
-            self._strangers.note(key, data)
-            return RefusedMessage.NO_ENVELOPE
         sender = self.members.by_key.get(envelope.head.fingerprint)
         if sender is None:
             return RefusedMessage.UNKNOWN_KEY
@@ -465,13 +415,6 @@ class SignedGuard:
                 return RefusedMessage.REPLAYED
             heard.hear(envelope.head, now_s)
         return None
-
-    def _refuse(self, reason: RefusedMessage, key: str) -> None:
-        with self._lock:
-            self._refused[reason] += 1
-            first = self._refused[reason] == 1
-        if first:
-            log.warning("a message is not listened to", why=reason.value, key=key)
 
 
 class _SealingLink:

@@ -250,7 +250,7 @@ def test_a_member_cannot_speak_for_another_nor_make_it_old(group: Group) -> None
     with (
         Robot(group, 1) as first,
         Robot(group, 2) as second,
-        Robot(group, 3) as third,
+        Robot(group, 3, start=2) as third,
         stranger() as stolen,
     ):
         eventually_hear(first, b"before", second)
