@@ -149,14 +149,7 @@ def _program_summary(record: FlightRecord, robot: int) -> dict[str, Any]:
             "rejected": {reason: count for reason, count in counts.items() if count},
         },
         "loops": {
-            name: {
-                "ticks": loop.ticks,
-                "overruns": loop.overruns,
-                "failures": loop.failures,
-                "lateness_p50_ms": round(loop.lateness_p50_ms, 2),
-                "lateness_p99_ms": round(loop.lateness_p99_ms, 2),
-                "lateness_max_ms": round(loop.lateness_max_ms, 2),
-            }
+            name: {each: round(value, 2) for each, value in asdict(loop).items()}
             for name, loop in (last.loops if last else {}).items()
         },
         "logs": list(program.logs),
