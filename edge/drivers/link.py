@@ -3,8 +3,7 @@
 from edge.core.schema import no_options
 from edge.drivers.multicast import MulticastLink
 from edge.drivers.zenoh_link import ZenohLink
-from edge.identity.group import TOPICS_OF_GROUP
-from edge.messages.topics import LinkSetting
+from edge.messages.topics import MESSAGE, LinkSetting
 
 
 def zenoh_link(setting: LinkSetting) -> ZenohLink | MulticastLink:
@@ -13,7 +12,6 @@ def zenoh_link(setting: LinkSetting) -> ZenohLink | MulticastLink:
     Raises LinkError or ConfigError.
     """
     no_options("link", setting.options)
-    in_group = () if setting.group is None else TOPICS_OF_GROUP
     zenoh = ZenohLink(
         fleet=setting.fleet,
         robot_id=setting.robot_id,
@@ -22,7 +20,11 @@ def zenoh_link(setting: LinkSetting) -> ZenohLink | MulticastLink:
         scouting=setting.scouting,
         # Robots in a group have nothing to say to each other besides: grounds call them.
         autoconnect=setting.group is None,
-        subscriptions={t: c for t, c in setting.subscriptions.items() if t not in in_group},
+        subscriptions={
+            topic: callback
+            for topic, callback in setting.subscriptions.items()
+            if topic != MESSAGE or setting.group is None
+        },
         tls=setting.tls,
         members=setting.members,
     )
@@ -31,6 +33,6 @@ def zenoh_link(setting: LinkSetting) -> ZenohLink | MulticastLink:
     return MulticastLink(
         setting.group,
         robot_id=setting.robot_id,
-        subscriptions=setting.subscriptions,
+        on_message=setting.subscriptions.get(MESSAGE),
         zenoh=zenoh,
     )

@@ -11,7 +11,6 @@ import select
 import socket
 import time
 from collections import Counter
-from collections.abc import Mapping
 from contextlib import suppress
 from threading import Event, Lock, Thread
 from typing import Self
@@ -21,7 +20,6 @@ from edge.core.wire import MAX_ROBOT_ID
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID, ZenohLink
 from edge.identity.envelope import read_head
 from edge.identity.group import (
-    TOPICS_OF_GROUP,
     Assembly,
     Fragment,
     GroupKey,
@@ -29,7 +27,7 @@ from edge.identity.group import (
     open_datagram,
 )
 from edge.messages.admission import Admission
-from edge.messages.topics import Group, GroupKeys, ReceiveCallback, Topic
+from edge.messages.topics import MESSAGE, Group, GroupKeys, ReceiveCallback, Topic
 
 # Of a hundred robots' messages those of a second, where the kernel allows as much (rmem_max).
 _BUFFER_BYTES = 2**19
@@ -46,7 +44,7 @@ _CLAIMED_FOR_S = 3.0
 # floods the group, and no buffer holds that for as long.
 _MANY_HZ, _FLOOD_HZ, _COUNTS_FOR_S, _TOGETHER_S = 100.0, 1000.0, 1.0, 0.1
 # By the present and by the former key: whoever claims them all takes no other's place.
-_MOST_PLACES = 2 * len(TOPICS_OF_GROUP) * (MAX_CERTIFIED_ID + 1)
+_MOST_PLACES = 2 * (MAX_CERTIFIED_ID + 1)
 
 
 class MulticastLink:
@@ -62,19 +60,18 @@ class MulticastLink:
         group: Group,
         *,
         robot_id: int | None,
-        subscriptions: Mapping[Topic, ReceiveCallback],
+        on_message: ReceiveCallback | None,
         zenoh: ZenohLink,
     ) -> None:
         """Join the group, and stay in it; without a network it joins once there is one.
 
-        `subscriptions` are as `ZenohLink` has them: those to the group's topics count here. `zenoh`
-        is closed with it. What this link says does not come back; with `robot_id` None it only
-        listens.
+        `on_message` is told the others' messages; `zenoh` is closed with it. What this link says
+        does not come back; with `robot_id` None it only listens.
         """
         self._group = group
         self._robot_id = robot_id
         self._zenoh = zenoh
-        self._callbacks = {t: c for t, c in subscriptions.items() if t in TOPICS_OF_GROUP}
+        self._on_message = on_message
         self._known: GroupKeys | None = None
         self._keys: tuple[GroupKey, ...] = ()
         self._own_start = -1  # Of this program, once it has spoken.
@@ -98,7 +95,7 @@ class MulticastLink:
 
     def publish(self, topic: Topic, data: bytes) -> None:
         """Send to whoever listens; it may be lost. Raises KeyError for a topic of the ground's."""
-        if topic not in TOPICS_OF_GROUP or self._robot_id is None:
+        if topic != MESSAGE or self._robot_id is None:
             self._zenoh.publish(topic, data)
             return
         head = read_head(data)
@@ -109,10 +106,10 @@ class MulticastLink:
             self._sender.setsockopt(
                 socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._group.interface)
             )
-            for datagram in datagrams(data, topic=topic, sender=self._robot_id, key=spoken):
+            for datagram in datagrams(data, sender=self._robot_id, key=spoken):
                 self._sender.sendto(datagram, (self._group.address, self._group.port))
         except (OSError, ValueError) as error:  # No network, a full queue, or too large a message.
-            self._failed(f"publish {topic.name}", error)
+            self._failed("publish", error)
 
     def is_claimed(self, robot_id: int) -> bool:
         """Whether another session says that it is that robot."""
@@ -182,18 +179,17 @@ class MulticastLink:
 
     def _take(self, fragment: Fragment, now_s: float) -> None:
         message = self._assembly.add(fragment, now_s, time.time())
-        callback = self._callbacks.get(fragment.topic)
-        if message is None or callback is None:
+        if message is None or self._on_message is None:
             return
-        key = f"robot/{fragment.sender}/{fragment.topic.name}"
+        key = f"robot/{fragment.sender}/{MESSAGE.name}"
         # Who has a former key alone takes nothing from those who have the present one.
         share = f"{fragment.key}/{key}"
-        if not self._admission.admits(fragment.topic, share, len(message), now_s):
+        if not self._admission.admits(MESSAGE, share, len(message), now_s):
             return
         try:
-            is_theirs = callback(key, message)
+            is_theirs = self._on_message(key, message)
         except Exception as error:
-            self._failed(f"callback {fragment.topic.name}", error)
+            self._failed("callback", error)
             return
         if is_theirs is not False:
             self._assembly.heard(fragment, now_s)

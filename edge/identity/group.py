@@ -8,7 +8,7 @@ A datagram, little-endian:
 | offset | type | field |
 | --- | --- | --- |
 | 0 | 2 bytes | magic, `LG` |
-| 2 | uint8 | version of this layout, 2 |
+| 2 | uint8 | version of this layout, 3 |
 | 3 | 4 bytes | the key, by its fingerprint |
 | 7 | 24 bytes | nonce, random |
 | 31 | 16 bytes | Poly1305 authentication tag |
@@ -18,12 +18,11 @@ A fragment:
 
 | offset | type | field |
 | --- | --- | --- |
-| 0 | uint8 | topic, by its number in `TOPICS_OF_GROUP` |
-| 1 | uint16 | the sender's robot id |
-| 3 | uint8 | which fragment of the message, from 0 |
-| 4 | uint8 | how many it has |
-| 5 | 29 bytes | head of the message's envelope: the same in each of its fragments |
-| 34 | | its part of what is behind that |
+| 0 | uint16 | the sender's robot id |
+| 2 | uint8 | which fragment of the message, from 0 |
+| 3 | uint8 | how many it has |
+| 4 | 29 bytes | head of the message's envelope: the same in each of its fragments |
+| 33 | | its part of what is behind that |
 """
 
 import hashlib
@@ -45,19 +44,16 @@ from nacl.exceptions import CryptoError
 
 from edge.identity.envelope import HEAD_BYTES, read_head
 from edge.identity.news import MessageNumber, Newest
-from edge.messages.topics import MESSAGE, Topic
 
 KEY_BYTES: int = crypto_secretbox_KEYBYTES
 MOST_FRAGMENTS = 3
 # What fits into one frame of 1500 bytes, behind the headers of IPv4 and UDP.
 DATAGRAM_BYTES = 1472
-# What robots tell each other; everything else is for the ground, or by it.
-TOPICS_OF_GROUP = (MESSAGE,)
 
-_MAGIC, _VERSION = b"LG", 2
+_MAGIC, _VERSION = b"LG", 3
 _FINGERPRINT_BYTES, _TAG_BYTES = 4, 16
 _HEAD = struct.Struct(f"<2sB{_FINGERPRINT_BYTES}s{crypto_secretbox_NONCEBYTES}s")
-_FRAGMENT = struct.Struct(f"<BHBB{HEAD_BYTES}s")
+_FRAGMENT = struct.Struct(f"<HBB{HEAD_BYTES}s")
 PART_BYTES = DATAGRAM_BYTES - _HEAD.size - _TAG_BYTES - _FRAGMENT.size
 MOST_BYTES = HEAD_BYTES + MOST_FRAGMENTS * PART_BYTES
 # A sender's fragments come one after another; a fourth message in pieces means that one is lost.
@@ -89,7 +85,6 @@ class Fragment(NamedTuple):
     """A part of a message, as a member sent it; `key` is the place of its key among those known."""
 
     key: int
-    topic: Topic
     sender: int
     place: int
     of: int
@@ -103,7 +98,7 @@ def frames(message_bytes: float) -> int:
     return max(1, math.ceil((message_bytes - HEAD_BYTES) / PART_BYTES))
 
 
-def datagrams(message: bytes, *, topic: Topic, sender: int, key: GroupKey) -> list[bytes]:
+def datagrams(message: bytes, *, sender: int, key: GroupKey) -> list[bytes]:
     """The message, which has an envelope, in datagrams.
 
     Raises ValueError for one that takes more than three.
@@ -111,11 +106,11 @@ def datagrams(message: bytes, *, topic: Topic, sender: int, key: GroupKey) -> li
     count = frames(len(message))
     if count > MOST_FRAGMENTS:
         raise ValueError(f"a message of {len(message)} bytes: a group takes {MOST_BYTES} at most")
-    topic_number, envelope_head = TOPICS_OF_GROUP.index(topic), message[:HEAD_BYTES]
+    envelope_head = message[:HEAD_BYTES]
     sealed = []
     for place in range(count):
         at = HEAD_BYTES + place * PART_BYTES
-        fragment = _FRAGMENT.pack(topic_number, sender, place, count, envelope_head)
+        fragment = _FRAGMENT.pack(sender, place, count, envelope_head)
         nonce = randombytes(crypto_secretbox_NONCEBYTES)
         head = _HEAD.pack(_MAGIC, _VERSION, key.fingerprint, nonce)
         part = message[at : at + PART_BYTES]
@@ -135,14 +130,12 @@ def open_datagram(data: bytes, keys: Sequence[GroupKey]) -> Fragment | None:
         opened: bytes = crypto_secretbox_open(data[_HEAD.size :], nonce, keys[which].secret)
     except CryptoError:
         return None
-    topic, sender, place, of, envelope_head = _FRAGMENT.unpack_from(opened)
+    sender, place, of, envelope_head = _FRAGMENT.unpack_from(opened)
     head = read_head(envelope_head)
-    if topic >= len(TOPICS_OF_GROUP) or not place < of <= MOST_FRAGMENTS or head is None:
+    if not place < of <= MOST_FRAGMENTS or head is None:
         return None
     part = opened[_FRAGMENT.size :]
-    return Fragment(
-        which, TOPICS_OF_GROUP[topic], sender, place, of, envelope_head, head.number, part
-    )
+    return Fragment(which, sender, place, of, envelope_head, head.number, part)
 
 
 # Pieces that say otherwise of their message are of another one: its number and the head that it is
@@ -152,7 +145,7 @@ _Pieces = tuple[MessageNumber, bytes, int, int]
 
 @dataclass(slots=True)
 class _Sender:
-    """Parts of one sender's messages on one topic; `key` is the newest that it spoke with."""
+    """Parts of one sender's messages; `key` is the newest that it spoke with."""
 
     newest: Newest = field(default_factory=Newest)
     newest_at_s: float = -math.inf
@@ -174,7 +167,7 @@ class Assembly:
 
     def __init__(self, forget_after_s: float = math.inf) -> None:
         self._forget_after_s = forget_after_s
-        self._senders: dict[tuple[Topic, int], _Sender] = {}
+        self._senders: dict[int, _Sender] = {}
         self.old = 0
 
     def add(self, fragment: Fragment, now_s: float, unix_s: float | None = None) -> bytes | None:
@@ -212,7 +205,7 @@ class Assembly:
         }
 
     def _sender(self, fragment: Fragment) -> _Sender:
-        who, senders = (fragment.topic, fragment.sender), self._senders
+        who, senders = fragment.sender, self._senders
         if who not in senders:
             if len(senders) >= _MOST_SENDERS:
                 # A member may claim any number of ids: those go first of which nothing was heard,

@@ -174,7 +174,7 @@ def test_of_two_programs_without_keys_each_hears_that_the_other_has_its_id(group
 
     def program() -> MulticastLink:
         return MulticastLink(
-            everyones, robot_id=1, subscriptions={},
+            everyones, robot_id=1, on_message=None,
             zenoh=ZenohLink(fleet="test", robot_id=1, listen=[endpoint()], autoconnect=False),
         )  # fmt: skip
 
@@ -212,7 +212,7 @@ def test_strangers_are_not_heard_whatever_they_say(group: Group) -> None:
         eventually_hear(first, b"before", second)
         eventually(lambda: recorded)
         forged = datagrams(
-            enclose(b"I am r1", MessageNumber(9, 9)), topic=MESSAGE, sender=1,
+            enclose(b"I am r1", MessageNumber(9, 9)), sender=1,
             key=GroupKey.of(b"x" * 32),
         )  # fmt: skip
         heard = dict(second.heard)
@@ -265,7 +265,7 @@ def test_a_member_cannot_speak_for_another_nor_make_it_old(group: Group) -> None
             mine,
             genuine[:at] + start + sequence + genuine[HEAD_BYTES:],
         ):
-            (datagram,) = datagrams(message, topic=MESSAGE, sender=1, key=GroupKey.of(KEY))
+            (datagram,) = datagrams(message, sender=1, key=GroupKey.of(KEY))
             stolen.sendto(datagram, place)
         eventually(lambda: {"not_allowed", "forged"} <= second.guard.refused().keys())
         eventually_hear(first, b"after", second)
@@ -284,7 +284,7 @@ def test_one_packet_with_a_stolen_key_mutes_no_robot_for_good(group: Group) -> N
                 address=Address(AUTHORITY.public_key, "robot/1/message"),
                 number=MessageNumber(start, 2**32 - 1),
             )
-            (datagram,) = datagrams(said, topic=MESSAGE, sender=1, key=GroupKey.of(KEY))
+            (datagram,) = datagrams(said, sender=1, key=GroupKey.of(KEY))
             return datagram
 
         place = group.address, group.port
@@ -309,7 +309,7 @@ def said_by_thief(signer: Signer, claimed: Signer, key: bytes) -> bytes:
     address = Address(AUTHORITY.public_key, "robot/1/message")
     message = seal(b"no word of r1", signer=signer, address=address, number=GREATEST)
     message = message.replace(signer.fingerprint, claimed.fingerprint, 1)
-    (datagram,) = datagrams(message, topic=MESSAGE, sender=1, key=GroupKey.of(key))
+    (datagram,) = datagrams(message, sender=1, key=GroupKey.of(key))
     return datagram
 
 
@@ -373,8 +373,7 @@ def test_whoever_has_the_former_key_alone_drowns_out_no_robot_that_begins(
         datagram
         for number, name in enumerate(itertools.islice(itertools.cycle(names), 2000))
         for datagram in datagrams(
-            enclose(b"x" * 100, MessageNumber(2**40, number)),
-            topic=MESSAGE, sender=name, key=GroupKey.of(FORMER),
+            enclose(b"x" * 100, MessageNumber(2**40, number)), sender=name, key=GroupKey.of(FORMER),
         )
     ]  # fmt: skip
     with Robot(group, 2) as second, flooding(group, said, 800.0):

@@ -19,7 +19,6 @@ from edge.identity.group import (
     open_datagram,
 )
 from edge.identity.news import MessageNumber
-from edge.messages.topics import MESSAGE
 
 KEY, FORMER, ANOTHER = (GroupKey.of(bytes([n]) * 32) for n in range(3))
 numbers = st.builds(MessageNumber, st.integers(0, 2**48 - 1), st.integers(0, 2**32 - 1))
@@ -37,7 +36,7 @@ def sent(
     key: GroupKey = KEY,
 ) -> list[bytes]:
     message = enclose(payload, MessageNumber(start, sequence))
-    return datagrams(message, topic=MESSAGE, sender=sender, key=key)
+    return datagrams(message, sender=sender, key=key)
 
 
 def put_together(assembly: Assembly, pieces: Sequence[bytes], *, heard: bool = True) -> list[bytes]:
@@ -59,14 +58,14 @@ def test_a_message_comes_out_as_it_went_in(
     payload: bytes, sender: int, number: MessageNumber, key: GroupKey, random: object
 ) -> None:
     message = enclose(payload, number)
-    pieces = datagrams(message, topic=MESSAGE, sender=sender, key=key)
+    pieces = datagrams(message, sender=sender, key=key)
     assert len(pieces) == frames(len(message)) <= 3
     assert all(len(piece) <= DATAGRAM_BYTES for piece in pieces)
     random.shuffle(pieces)  # type: ignore[attr-defined]
     fragments = [open_datagram(piece, (KEY, FORMER)) for piece in pieces]
     for fragment in fragments:
         assert fragment is not None
-        assert (fragment.topic, fragment.sender, fragment.number) == (MESSAGE, sender, number)
+        assert (fragment.sender, fragment.number) == (sender, number)
     assert put_together(Assembly(), pieces) == [payload]
 
 
@@ -166,7 +165,7 @@ def test_an_open_fleets_robot_may_come_back_with_an_earlier_clock() -> None:
 
 def test_what_has_no_envelope_does_not_come_through() -> None:
     for message in (b"", b"hello" * 40):
-        (piece,) = datagrams(message, topic=MESSAGE, sender=7, key=KEY)
+        (piece,) = datagrams(message, sender=7, key=KEY)
         assert open_datagram(piece, (KEY,)) is None
 
 
