@@ -18,6 +18,7 @@ from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, Separation
 from lpac.analysis.logs import Logs, Progress, configured, read_logs
 from lpac.analysis.missions import Mission, find_missions, record_of
+from lpac.analysis.statistics import finite
 
 _MOST_NOTES = 3  # in one line
 
@@ -275,13 +276,13 @@ def _values(record: FlightRecord) -> dict[str, Any]:
             "initial": _first(record.cost, 0),
             "final": _first(record.cost, -1),
             "normalized": _first(record.normalized, -1),
-            "lloyd": _number(record.lloyd),
-            "normalized_lloyd": _number(record.normalized_lloyd),
+            "lloyd": finite(record.lloyd),
+            "normalized_lloyd": finite(record.normalized_lloyd),
             "time_s": record.curve_time_s[: len(record.normalized)].round(3).tolist(),
             "curve": record.normalized.round(6).tolist(),
         },
         "separation": _apart(record.separation),
-        "fence_margin_m": _number(record.fence_margin_m),
+        "fence_margin_m": finite(record.fence_margin_m),
         "truth": {
             "cost": {
                 "initial": _first(record.true_cost, 0),
@@ -289,7 +290,7 @@ def _values(record: FlightRecord) -> dict[str, Any]:
                 "normalized": _first(record.normalized_true, -1),
             },
             "separation": _apart(record.true_separation),
-            "fence_margin_m": _number(record.true_fence_margin_m),
+            "fence_margin_m": finite(record.true_fence_margin_m),
         }
         if record.truth
         else None,
@@ -302,9 +303,9 @@ def _values(record: FlightRecord) -> dict[str, Any]:
             "came": len(messages.heard_at_s),
             "lost": messages.lost,
             "rejected": messages.rejected,
-            "loss_share": _number(messages.loss_share),
-            "age_p50_s": _number(messages.age_quantile_s(0.5)),
-            "age_p99_s": _number(messages.age_quantile_s(0.99)),
+            "loss_share": finite(messages.loss_share),
+            "age_p50_s": finite(messages.age_quantile_s(0.5)),
+            "age_p99_s": finite(messages.age_quantile_s(0.99)),
             "ages_corrected": record.clocks_known,
         },
         "loops": {
@@ -327,8 +328,4 @@ def _apart(separation: Separation | None) -> dict[str, Any] | None:
 
 
 def _first(values: Any, index: int) -> float | None:
-    return _number(float(values[index])) if len(values) else None
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+    return finite(float(values[index])) if len(values) else None

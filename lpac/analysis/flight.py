@@ -312,17 +312,24 @@ class FlightRecord:
     fault: FaultRecord = FaultRecord()
 
     @property
+    def of_points(self) -> bool:
+        """Whether it is of points, which are where they take themselves to be."""
+        return not any(robot.statuses for robot in self.robots)
+
+    @property
     def time_s(self) -> F64:
         """Sample times (T,) of points. Raises ValueError for other robots."""
-        if not self.robots or any(robot.statuses for robot in self.robots):
-            raise ValueError(f"{self.name}: has no points")
-        return self.robots[0].time_s
+        return self._points()[0].time_s
 
     @property
     def positions_m(self) -> F64:
         """Positions (T, N, 2) of points, m. Raises ValueError for other robots."""
-        count = len(self.time_s)
-        return np.stack([robot.position_m[:count, :2] for robot in self.robots], axis=1)
+        return np.stack([robot.position_m[:, :2] for robot in self._points()], axis=1)
+
+    def _points(self) -> tuple[RobotRecord, ...]:
+        if not (self.robots and self.of_points):
+            raise ValueError(f"{self.name}: has no points")
+        return self.robots
 
     @property
     def flew_mission(self) -> bool:

@@ -33,6 +33,11 @@ _RESAMPLES = 2000
 _SEED = 0
 
 
+def finite(value: float) -> float | None:
+    """The value; None, as JSON has it, if it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
 class Interval95(NamedTuple):
     """A value and the ends of its 95 % interval; `low <= high`."""
 

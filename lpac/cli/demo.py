@@ -7,7 +7,7 @@ import typer
 
 from lpac.cli.apps import new_app
 from lpac.cli.options import DEFAULT_BUNDLE
-from lpac.cli.sim import fly_points
+from lpac.cli.sim import fly_showing
 
 app = new_app()
 
@@ -34,7 +34,7 @@ def demo(
         ("Lloyd, knowing the whole world", Scenario(seed=seed, controller="clairvoyant-cvt")),
     ]
     names = [name for name, _ in scenarios]
-    flown = dict(zip(names, fly_points(scenarios, DEFAULT_BUNDLE), strict=True))
+    flown = dict(zip(names, fly_showing(scenarios, DEFAULT_BUNDLE), strict=True))
     write_demo({name: (scenario, flown[name]) for name, scenario in scenarios}, out)
     costs = "; ".join(f"{name} {record.normalized[-1]:.3f}" for name, record in flown.items())
     typer.echo(f"coverage cost after 60 s over initial cost: {costs}")

@@ -167,7 +167,7 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
         run.out.mkdir(parents=True, exist_ok=True)
     if run.vehicle is VehicleKind.POINT:
         _tell_of_features_outside(drawn.world, scenario.features, run.bundle, scenario.world_size)
-        [record] = fly_points([(scenario.controller, scenario)], run.bundle)
+        [record] = fly_showing([(scenario.controller, scenario)], run.bundle)
     elif run.vehicle is VehicleKind.SIMULATED:
         record = _fly_on_clock(scenario, run)
     else:
@@ -290,7 +290,7 @@ def _robot_count(text: str | None, vehicle: VehicleKind) -> int | None:
     return count
 
 
-def fly_points(scenarios: list[tuple[str, "Scenario"]], bundle: Path) -> list["FlightRecord"]:
+def fly_showing(scenarios: list[tuple[str, "Scenario"]], bundle: Path) -> list["FlightRecord"]:
     """Simulate the named scenarios; how far each is goes to stderr."""
     from edge.drivers.registry import load_policy
     from edge.policy.family import verified

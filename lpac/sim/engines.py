@@ -147,7 +147,8 @@ class ClockedRobots(_WholeRobots):
     ) -> FlightRecord:
         if scenario.fault:
             with errors_only():
-                return drill_of(str(bundle)).fly(scenario, folder if logs else None)
+                drill = drill_of(str(bundle), load_bundle(bundle).id)
+                return drill.fly(scenario, folder if logs else None)
         return fly_simulated(
             scenario, folder, bundle, self.say, watch, logs=logs, recorded=self.recorded
         )
@@ -234,8 +235,6 @@ def fly(
         raise ValueError(f"fault = {scenario.fault}: such a flight is not watched")
     chosen = engine_of(engine, px4_build, say)
     chosen.require_able(scenario)
-    # Another bundle may be at that path by now.
-    drill_of.cache_clear()
     loaded = load_bundle(bundle) if engine == "point" and isinstance(bundle, Path) else bundle
     # In batches a policy that fails ends them; without, it is seen what its robots do.
     [record] = chosen.fly([scenario], loaded, folder, watch or (lambda _: None))
@@ -251,8 +250,8 @@ def require_flown(record: FlightRecord) -> None:
 
 # Kept, so that flights share their begin.
 @lru_cache(maxsize=1)
-def drill_of(bundle: str) -> SimulatedDrill:
-    """The drill with the bundle at a path."""
+def drill_of(bundle: str, bundle_id: str) -> SimulatedDrill:
+    """The drill with the bundle at a path, which may be another one by now."""
     return SimulatedDrill(Path(bundle))
 
 

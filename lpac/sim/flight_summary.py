@@ -10,6 +10,7 @@ from edge.core import F64
 from edge.core.counted import counted
 from lpac.analysis.flight import LOOPS, FlightRecord
 from lpac.analysis.logs import simulated_name
+from lpac.analysis.statistics import finite
 from lpac.sim.scenario import Scenario
 from lpac.sim.usual import judgement, usual_whole
 
@@ -79,8 +80,8 @@ def _of_script(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
             "time_s": least.time_s - script.start_s,
         },
         "fence": {
-            "margin_m": _number(margin_m),
-            "true_margin_m": _number(true_margin_m),
+            "margin_m": finite(margin_m),
+            "true_margin_m": finite(true_margin_m),
             "crossed": bool(margin_m < 0.0),
             "truly_crossed": bool(true_margin_m < 0.0),
         },
@@ -106,17 +107,13 @@ def _mission_share(record: FlightRecord, robot_id: int) -> float:
     return sum(record.mission_share(r) for r in record.robots if r.robot_id == robot_id)
 
 
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def _numbers(values: F64) -> list[float | None]:
-    return [_number(value) for value in values.round(6).tolist()]
+    return [finite(value) for value in values.round(6).tolist()]
 
 
 def _cost_summary(cost: F64, normalized: F64) -> dict[str, float | None]:
     def at(values: F64, index: int) -> float | None:
-        return _number(values[index]) if len(values) else None
+        return finite(values[index]) if len(values) else None
 
     return {
         "initial": at(cost, 0),

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 from edge.core.counted import counted
-from lpac.analysis.statistics import at_most_share
+from lpac.analysis.statistics import at_most_share, finite
 from lpac.shipped import SHIPPED_BUNDLE
 from lpac.sim.drill.bounds import Figure
 from lpac.sim.drill.faults import FAULTS
@@ -152,9 +152,7 @@ def _json(outcomes: Outcomes) -> dict[str, Any]:
 
 
 def _figure_json(figure: Figure) -> dict[str, Any]:
-    # JSON has no infinity.
-    value = figure.value if math.isfinite(figure.value) else None
-    return {**figure._asdict(), "value": value}
+    return {**figure._asdict(), "value": finite(figure.value)}
 
 
 def _rows(outcomes: Outcomes) -> Iterable[Sequence[object]]:

@@ -153,7 +153,7 @@ def curves_of(group: FlightGroup) -> list[tuple[PlannedFlight, CostCurve]]:
 def curve_of(flight: PlannedFlight, record: FlightRecord) -> CostCurve:
     """Cost over a flight, at true positions."""
     time_s = cost_times_s(flight.scenario.duration_s)
-    true_cost = record.true_cost if record.truth else record.cost
+    true_cost = record.cost if record.of_points else record.true_cost
     cost = np.interp(time_s, record.curve_time_s, true_cost)
     lloyd = record.lloyd if flight.scenario.controller == CLAIRVOYANT else None
     return CostCurve(tuple(time_s.tolist()), tuple(cost.tolist()), lloyd)

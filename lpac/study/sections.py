@@ -1,6 +1,5 @@
 """Sections of a report on whole flights: each is a figure or two, a table, and numbers."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from edge.core import F64
 from lpac.analysis import figures as flight_figures
 from lpac.analysis import style
 from lpac.analysis.flight import FlightRecord
+from lpac.analysis.statistics import finite
 from lpac.study import figures
 from lpac.study.perturbation import PerturbedFlight
 from lpac.study.repeatability import looked_at, looked_at_from_s, spread_of, who_is_missing
@@ -163,8 +163,7 @@ def _final(record: FlightRecord) -> str:
 
 def true_curve(record: FlightRecord) -> F64:
     """(C,): the cost for where the robots truly were, over the first; NaN where it is not known."""
-    points = not any(robot.statuses for robot in record.robots)
-    return record.normalized if points else record.normalized_true
+    return record.normalized if record.of_points else record.normalized_true
 
 
 def curves_json(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
@@ -177,17 +176,13 @@ def curves_json(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
         name: {
             "time_s": record.curve_time_s.tolist(),
             "normalized_cost": record.normalized.tolist(),
-            "normalized_true_cost": [_known(cost) for cost in true_curve(record).tolist()],
+            "normalized_true_cost": [finite(cost) for cost in true_curve(record).tolist()],
             "final": float(record.normalized[-1]),
-            "final_true": _known(true_curve(record)[-1]),
+            "final_true": finite(true_curve(record)[-1]),
             "final_positions_m": record.places_at(record.curve_time_s[-1]),
         }
         for name, record in records.items()
     }
-
-
-def _known(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def curves_csv(records: Mapping[str, FlightRecord]) -> list[list[object]]:

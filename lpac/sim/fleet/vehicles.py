@@ -53,8 +53,10 @@ class Vehicles(Protocol):
 def track_of(entries: Sequence[Truth]) -> TrueTrack:
     """Track of a simulated vehicle, on its own clock and in the world's frame."""
 
+    columns = dict(zip(Truth._fields, zip(*entries, strict=True), strict=False))
+
     def of(name: str, kind: type[Any], *shape: int) -> npt.NDArray[Any]:
-        return np.array([getattr(entry, name) for entry in entries], kind).reshape(-1, *shape)
+        return np.array(columns.get(name, ()), kind).reshape(-1, *shape)
 
     return TrueTrack(
         time_s=of("time_s", np.float64),
@@ -64,7 +66,7 @@ def track_of(entries: Sequence[Truth]) -> TrueTrack:
         mode=of("mode", np.int64),
         armed=of("armed", np.bool_),
         setpoint_at_s=of("setpoint_at_s", np.float64),
-        is_velocity=np.array([entry.follows == "velocity" for entry in entries], np.bool_),
+        is_velocity=np.array([each == "velocity" for each in columns.get("follows", ())], np.bool_),
         velocity_error_m_s=of("velocity_error_m_s", np.float64),
         commands=of("commands", np.int64),
     )
