@@ -481,7 +481,7 @@ def test_a_robot_with_an_altered_policy_says_so_and_does_not_arm(
         made.enable()
         made.wait_for_state(FlightState.PREFLIGHT)
         # All else is well by then.
-        problem = "action.onnx, swarm of the bundle do not compute"
+        problem = "action.onnx, swarm did not reproduce the bundle's golden"
         unverified = [CheckCode.BUNDLE_NOT_VERIFIED]
         made.wait(lambda status: codes(status.failed_checks) == unverified)
         assert problem in texts(made.status.failed_checks)

@@ -31,7 +31,7 @@ def test_it_says_what_it_came_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         [row] = [line for line in result.stdout.splitlines() if line.startswith(variant["name"])]
         assert f" {variant['mean'][0]:.3f} " in row
         assert variant["verdict"] is None or row.rstrip().endswith(variant["verdict"])
-    assert "2 training seeds: this says something about these policies" in result.stdout
+    assert "2 training seeds: the results hold for these policies" in result.stdout
     assert before.items() <= {each: each.read_bytes() for each in before}.items()
     again = called("ablate", path, "--out", out, "--json")
     assert json.loads(again.stdout) == told
