@@ -93,6 +93,8 @@ class FleetSnapshot:
     commander publishes. `running` are descriptions of the running commands. `commander_age_s` is
     the time since the commander was heard, 0 if it is this station. `shares_name`: another station
     uses this station's name. `members_problem`: fault of the list of members, "" if there is none.
+    `mission_s` is the time of this trial's mission, None without one, or if it had begun before
+    this station heard of it.
     """
 
     unix_time_s: float
@@ -103,6 +105,7 @@ class FleetSnapshot:
     commander_age_s: float = 0.0
     shares_name: bool = False
     members_problem: str = ""
+    mission_s: float | None = None
 
 
 EventKind = Literal["command", "result", "refusal", "state", "commander", "presence"]

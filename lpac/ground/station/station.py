@@ -24,6 +24,7 @@ from edge.messages.mission import (
     SafetyAction,
     world_id,
 )
+from lpac.analysis.mission_tracker import MissionTracker
 from lpac.analysis.snapshot import (
     COMMANDER_SILENT_S,
     EventKind,
@@ -78,6 +79,9 @@ class Station:
         # The hold that this station asks for while another commands.
         self._asked: Hold | None = None
         self._asked_at_s = -math.inf
+        self._missions = MissionTracker()
+        # Of the mission that began last: its trial, and when, Unix time; None: before it was heard.
+        self._mission: tuple[str, float | None] = "", None
         self._events: deque[GroundEvent] = deque(maxlen=_EVENTS_KEPT)
         self._new_events: list[GroundEvent] = []
 
@@ -147,7 +151,14 @@ class Station:
             commander_age_s=self.election.commander_age_s,
             shares_name=self.election.shares_name,
             members_problem=self.members_problem,
+            mission_s=self._mission_s,
         )
+
+    @property
+    def _mission_s(self) -> float | None:
+        (trial, began_s), state = self._mission, self.state
+        flown = self._missions.robots and state is not None and state.trial == trial
+        return self._robots.unix_now_s - began_s if flown and began_s is not None else None
 
     # Events
 
@@ -184,7 +195,10 @@ class Station:
 
     def hear_status(self, status: RobotStatus, other_release: str = "") -> None:
         """A robot's status came. One that is not of this fleet is nobody's."""
+        known = status.robot_id in self._robots.statuses()
         if self._robots.hear(status, other_release):
+            if self._missions.begins(status.robot_id, status, self.now_s):
+                self._mission = status.trial, self._robots.unix_now_s if known else None
             self.worlds.hear_status(status)
             self.orders.hear(status)
             self.election.hear_status(status)

@@ -5,7 +5,6 @@ send the same commands as anybody's. Quitting it changes nothing in the field.
 """
 
 import asyncio
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,10 +21,8 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 from textual.theme import Theme
 
-from edge.messages.mission import FlightState
-from lpac.analysis.mission_tracker import MissionTracker
-from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent
-from lpac.ground.alarms import Alarm, Before, Severity, alarms, is_flying
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+from lpac.ground.alarms import Alarm, Before, Severity, alarms
 from lpac.ground.rendering import Row, Span, TextStyle, gravest, in_order
 from lpac.ground.station.client import listen, send
 from lpac.ground.station.protocol import Request, Resume, SafetyCommand, ServerMessage, TakeCommand
@@ -128,16 +125,6 @@ _QUESTIONS = {
 }  # fmt: skip
 
 
-class _Entered(NamedTuple):
-    """Describe an event of a robot's new state."""
-
-    state: FlightState
-    trial: str
-    # Events do not tell.
-    boot_nonce: int = 0
-    armed: bool | None = None
-
-
 class Watch(App[str]):
     """The view. `screenshot`: quit after the first few pictures, and give it as SVG."""
 
@@ -171,9 +158,6 @@ class Watch(App[str]):
         self._before = Before()
         self._began_s = self._heard_at_s = time.monotonic()
         self._problem = "connecting"
-        self._mission_tracker = _of_events()
-        # The mission that began last: its trial, and when, Unix time.
-        self._mission = "", 0.0
         self._up_until_s: dict[str, tuple[Severity, float]] = {}
         self._rows: list[Row] = []
         self._alarms: tuple[Alarm, ...] = ()
@@ -228,8 +212,6 @@ class Watch(App[str]):
         now_s = time.monotonic()
         if isinstance(told, FleetSetup):
             self._setup = told
-        elif isinstance(told, GroundEvent) and self._setup is not None:
-            self._take_event(told, self._setup)
         elif isinstance(told, FleetSnapshot) and self._setup is not None:
             if self._problem:
                 self._before = Before()
@@ -240,14 +222,6 @@ class Watch(App[str]):
             if self._ends_by_screenshot and now_s - self._began_s > _SCREENSHOT_AFTER_S:
                 self.exit(self.export_screenshot())
 
-    def _take_event(self, event: GroundEvent, setup: FleetSetup) -> None:
-        """Some are older than this view. A ground that has just started knows of no trial yet."""
-        if event.state is None or not event.trial:
-            return
-        entered = _Entered(event.state, event.trial)
-        if self._mission_tracker.begins(setup.robots[event.robot], entered, event.unix_time_s):
-            self._mission = event.trial, event.unix_time_s
-
     def _look_at(self, snapshot: FleetSnapshot, setup: FleetSetup, now_s: float) -> None:
         self._alarms = alarms(setup, snapshot, self._before.take(snapshot, now_s))
         for robot, alarm in gravest(self._alarms).items():
@@ -255,8 +229,6 @@ class Watch(App[str]):
                 self._up_until_s[robot] = alarm.severity, now_s + _STAYS_UP_S
         lasting = {r: sev for r, (sev, until_s) in self._up_until_s.items() if now_s < until_s}
         self._rows = in_order(setup, snapshot, self._alarms, lasting)
-        if not _flying(snapshot):
-            self._mission_tracker = _of_events()
         if self._selected not in setup.robots and self._rows:
             self._selected = self._rows[0].robot.name
 
@@ -287,7 +259,7 @@ class Watch(App[str]):
         setup, snapshot = self._setup, self._snapshot
         if setup is None or snapshot is None:
             return
-        self._show("header", header(setup, snapshot, self._mission_s(snapshot), width))
+        self._show("header", header(setup, snapshot, width))
         alarms_height = self.query_one("#alarms").size.height
         self._show("alarms", few_alarms(self._alarms, width, alarms_height))
         self._draw_body(setup, snapshot, lost_s if self._problem else 0.0)
@@ -333,17 +305,6 @@ class Watch(App[str]):
 
     def _bottom(self) -> Span:
         return self._message if self._question is None else _asked(self._question)
-
-    def _mission_s(self, snapshot: FleetSnapshot) -> float | None:
-        """Since this trial's mission began; None once nobody has part in it."""
-        trial, began_s = self._mission
-        if (
-            not self._mission_tracker.robots
-            or snapshot.ground is None
-            or snapshot.ground.trial != trial
-        ):
-            return None
-        return snapshot.unix_time_s - began_s
 
     # Keys
 
@@ -413,15 +374,6 @@ class Watch(App[str]):
             said = Span(f"{word} NOT SENT: {error}", "critical")
         self._message = Span(f"{time.strftime('%H:%M:%S')} {said.text}", said.style)
         self._draw()
-
-
-def _flying(snapshot: FleetSnapshot) -> bool:
-    return any(r.status is not None and is_flying(r.status) for r in snapshot.robots)
-
-
-def _of_events() -> MissionTracker:
-    """Tracker over events, in which a robot that flies on says nothing."""
-    return MissionTracker(silent_s=math.inf)
 
 
 def _asked(question: _Question) -> Span:

@@ -48,11 +48,9 @@ HELP = (
 )
 
 
-def header(
-    setup: FleetSetup, snapshot: FleetSnapshot, mission_s: float | None, width: int
-) -> list[Line]:
-    """Three lines about the fleet. `mission_s` is how long this trial's mission has been flown."""
-    ground = snapshot.ground
+def header(setup: FleetSetup, snapshot: FleetSnapshot, width: int) -> list[Line]:
+    """Three lines about the fleet."""
+    ground, mission_s = snapshot.ground, snapshot.mission_s
     clock = "" if mission_s is None else f"mission {duration(mission_s)}"
     who = _commander(setup, snapshot)
     trial = "" if ground is None or not ground.trial else f"trial {ground.trial}"
@@ -215,7 +213,7 @@ def all_of_it(
     shown = columns(setup, width)
     rows = in_order(setup, snapshot, alarms)
     lines = [
-        *header(setup, snapshot, None, width),
+        *header(setup, snapshot, width),
         *alarm_lines(alarms, width),
         line(width),
         *heading(shown),

@@ -217,18 +217,10 @@ async def told(
         await left.wait()
 
 
-def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
-    """To a view that opens late, both flights' events are told."""
-
+def test_the_missions_clock() -> None:
     async def use() -> None:
-        flown = ((800.0, _S.MISSION), (900.0, _S.LANDED), (935.0, _S.HOLD), (940.0, _S.MISSION))
-        events = [
-            GroundEvent(at_s, "state", name, "x", trial="t1", state=state)
-            for at_s, state in flown
-            for name in ("r0", "r1")
-        ]
-        seen_last = snapshot(robot(status(0)), robot(status(1)), unix_time_s=1000.0)
-        async with told(setup(2), lambda: seen_last, events), watching("field") as seen:
+        seen_last = snapshot(robot(status(0)), robot(status(1)), mission_s=60.0)
+        async with told(setup(2), lambda: seen_last), watching("field") as seen:
             await seen.until(lambda: "mission 01:00" in seen.text("header"))
 
     asyncio.run(use())

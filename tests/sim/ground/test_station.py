@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from edge.identity.guard import Speaker, Unguarded
 from edge.identity.members import Role
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode, RefusalCode
-from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Place, world_id
+from edge.messages.mission import ORDER_LIFETIME_S, FlightState, GroundState, Place, world_id
 from lpac.ground.alarms import AlarmCode, alarms
 from lpac.ground.station.protocol import (
     Enable,
@@ -39,7 +39,7 @@ from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import SimulatedGround
 from tests.said import not_done, problem
 from tests.sim.ground.field import Field, a_field
-from tests.unit.ground.snapshots import on_ground, setup
+from tests.unit.ground.snapshots import on_ground, setup, status
 
 ANYBODY = Speaker(Role.OPERATOR, "")
 
@@ -52,6 +52,33 @@ def pad_m(field: Field, i: int) -> tuple[float, ...]:
 
 
 # One station
+
+
+def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
+    station = Station(setup(2), 0.0, 700.0)
+    state = GroundState(4, "bob", trial="t1")
+    flown = (
+        (800.0, _S.HOLD, None), (820.0, _S.MISSION, 0.0), (850.0, _S.HOLD, 30.0),
+        (900.0, _S.LANDED, None), (935.0, _S.HOLD, None), (940.0, _S.MISSION, 0.0),
+        (1000.0, _S.MISSION, 60.0),
+    )  # fmt: skip
+    sequence, before = itertools.count(), _S.IDLE
+    for unix_s, phase, mission_s in flown:
+        # Statuses come twice a second.
+        for at_s, said in ((unix_s - 0.5, before), (unix_s, phase)):
+            station.set_time(at_s - 700.0, at_s)
+            station.election.hear_state(state, ANYBODY)
+            armed = said not in (_S.IDLE, _S.LANDED)
+            for robot_id in (0, 1):
+                changes = {"sequence": next(sequence), "state": said, "armed": armed}
+                station.hear_status(status(robot_id, **changes))
+        assert station.snapshot().mission_s == mission_s
+        before = phase
+    # A station that begins to listen meanwhile does not know when it began.
+    late = Station(setup(2), 0.0, 1000.0)
+    late.election.hear_state(state, ANYBODY)
+    late.hear_status(status(0))
+    assert late.snapshot().mission_s is None
 
 
 def test_nothing_is_said_before_the_first_command() -> None:

@@ -119,9 +119,11 @@ def test_header_says_who_commands_and_who_asked() -> None:
     ground = GroundState(
         5, "bob", ORIGIN, enabled=True, safety_action="hold", safety_action_by="carol", trial="t2"
     )
-    seen = snapshot(robot(status(0)), commander="bob", ground=ground, running=("takeoff",))
-    lines = ["".join(span.text for span in line) for line in header(setup(1), seen, 125.0, 90)]
-    assert [s.style for s in header(setup(1), seen, 125.0, 90)[0]][2] == "foreign"
+    seen = snapshot(
+        robot(status(0)), commander="bob", ground=ground, running=("takeoff",), mission_s=125.0
+    )
+    lines = ["".join(span.text for span in line) for line in header(setup(1), seen, 90)]
+    assert [s.style for s in header(setup(1), seen, 90)[0]][2] == "foreign"
     assert lines[0].split("  ")[:3] == ["field", "bob commands, alice observes", "trial t2"]
     assert lines[0].rstrip().endswith("mission 02:05")
     assert plain([KEYS]) == (
@@ -139,7 +141,7 @@ def test_header_says_who_commands_and_who_asked() -> None:
 def test_a_heading_is_below_360_degrees_however_it_is_rounded() -> None:
     origin = replace(ORIGIN, heading_deg=359.96)
     ground = GroundState(5, "alice", origin, enabled=True)
-    lines = header(setup(1), snapshot(robot(status(0)), ground=ground), None, 90)
+    lines = header(setup(1), snapshot(robot(status(0)), ground=ground), 90)
     assert " 0°  bundle" in "".join(span.text for span in lines[2])
     row = Row(robot(status(0, origin=origin, heading_rad=math.radians(-0.1))), None, setup(1))
     known = "\n".join("".join(s.text for s in line) for line in detail(row, snapshot(), (), 90))
@@ -148,14 +150,14 @@ def test_a_heading_is_below_360_degrees_however_it_is_rounded() -> None:
 
 def test_safety_action_of_single_robots() -> None:
     ground = GroundState(5, "alice", enabled=True, robot_safety_actions={"1": "land", "0": "hold"})
-    lines = header(setup(2), snapshot(ground=ground), None, 80)
+    lines = header(setup(2), snapshot(ground=ground), 80)
     assert "HOLD r0, LAND r1 by alice" in "".join(span.text for span in lines[1])
     fence = replace(FENCE, vertices_m=((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)))
     ground = GroundState(
         5, "alice", enabled=False, safety_action="hold", robot_enabled={"1": True}, fence=fence,
         robot_safety_actions={"0": "none", "1": "hold"}, world_id="0123456789",
     )  # fmt: skip
-    lines = header(setup(2), snapshot(ground=ground), None, 80)
+    lines = header(setup(2), snapshot(ground=ground), 80)
     assert plain(lines[1:]) == (
         "not enabled but 1  HOLD, FLY r0 by alice  fence 4x4 m, 2-100 m high\n"
         "no origin  bundle 79929121  world 01234567"
