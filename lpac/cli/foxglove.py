@@ -28,7 +28,8 @@ def live(
 
     from edge.core.address import require_host
     from lpac.fleet.settings import load_fleet
-    from lpac.ground.foxglove.live import serve
+    from lpac.ground.foxglove.live import serving
+    from lpac.ground.serve import serve
 
     require_host("--host", host)
     name = load_fleet(fleet).fleet
@@ -38,7 +39,7 @@ def live(
         typer.echo("it only observes; `lpac foxglove layout` writes the panels to import")
         typer.echo("Ctrl-C ends it, and nothing else")
 
-    asyncio.run(serve(name, host=host, port=port, ready=ready))
+    asyncio.run(serve(serving(name, host=host, port=port), ready))
 
 
 @app.command()

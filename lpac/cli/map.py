@@ -48,20 +48,19 @@ def live_map(page: MapOptions) -> None:
 
     from edge.core.address import require_host
     from lpac.fleet.settings import load_fleet
-    from lpac.ground.map.server import serve
+    from lpac.ground.map.server import serving
+    from lpac.ground.serve import serve
 
     require_host("--host", page.host)
     config = load_fleet(page.fleet)
     # With "::" asyncio would serve IPv6 alone, of which a field's network has no address to open.
     host = "0.0.0.0" if page.host == "::" else page.host
     access = _access(host, page)
-    asyncio.run(
-        serve(
-            config.fleet, host=host, port=page.port, operate=page.operate, access=access,
-            tls=_tls(config, host) if page.over_tls else None,
-            ready=lambda addresses: _on_ready(config.fleet, addresses, page),
-        )
-    )  # fmt: skip
+    tls = _tls(config, host) if page.over_tls else None
+    server = serving(
+        config.fleet, host=host, port=page.port, operate=page.operate, access=access, tls=tls
+    )
+    asyncio.run(serve(server, lambda addresses: _on_ready(config.fleet, addresses, page)))
 
 
 def _access(host: str, page: MapOptions) -> "Access":

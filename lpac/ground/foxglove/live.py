@@ -6,9 +6,8 @@ has a queue of its own, so that a slow one misses messages, and no other does.
 
 import asyncio
 import contextlib
-import signal
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 
 from foxglove import Context, StatusLevel, start_server
 from foxglove.websocket import WebSocketServer
@@ -46,17 +45,6 @@ async def serving(fleet: str, *, host: str, port: int) -> AsyncIterator[int]:
         with contextlib.suppress(asyncio.CancelledError):
             await following
         server.stop()
-
-
-async def serve(fleet: str, *, host: str, port: int, ready: Callable[[int], None]) -> None:
-    """Serve until SIGINT or SIGTERM; `ready` is told the port. Raises OSError."""
-    ended = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ended.set)
-    async with serving(fleet, host=host, port=port) as its_port:
-        ready(its_port)
-        await ended.wait()
 
 
 async def _follow(fleet: str, channels: Channels, server: WebSocketServer) -> None:

@@ -7,7 +7,6 @@ beside it, in threads.
 import asyncio
 import contextlib
 import json
-import signal
 import ssl
 import time
 from collections import deque
@@ -442,25 +441,3 @@ async def serving(
                     task.cancel()
                 # Pages are told before their connections end.
                 await runner.shutdown()
-
-
-async def serve(
-    fleet: str,
-    *,
-    host: str,
-    port: int,
-    access: Access,
-    operate: bool,
-    tls: ssl.SSLContext | None,
-    ready: Callable[[list[str]], None],
-) -> None:
-    """Serve until SIGINT or SIGTERM; `ready` is told the addresses. Raises OSError."""
-    ended = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ended.set)
-    async with serving(
-        fleet, host=host, port=port, access=access, operate=operate, tls=tls
-    ) as addresses:
-        ready(addresses)
-        await ended.wait()

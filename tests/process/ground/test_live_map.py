@@ -511,10 +511,10 @@ def test_a_flight_by_clicks(few: FlownFleet, short_path: Path) -> None:
 def test_the_terminal_says_that_there_is_no_ground(
     few: FlownFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def serve(fleet: str, *, ready: Callable[[list[str]], None], **_: object) -> None:
+    async def serve(_: object, ready: Callable[[list[str]], None]) -> None:
         ready(["http://127.0.0.1:8300/"])
 
-    monkeypatch.setattr("lpac.ground.map.server.serve", serve)
+    monkeypatch.setattr("lpac.ground.serve.serve", serve)
     said = CliRunner().invoke(app, ["map", "--fleet", str(few.fleet_toml)]).stdout.splitlines()
     assert said[0].endswith("http://127.0.0.1:8300/")
     assert "start `lpac ground`; until then the map shows nothing" in said[-1]

@@ -1,0 +1,20 @@
+"""Servers of views, which run until they are stopped."""
+
+import asyncio
+import signal
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+async def serve(server: AbstractAsyncContextManager[T], ready: Callable[[T], None]) -> None:
+    """Serve until SIGINT or SIGTERM; `ready` is told where. Raises what the server raises."""
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ended.set)
+    async with server as where:
+        ready(where)
+        await ended.wait()
