@@ -5,7 +5,7 @@ from typing import Literal
 
 from edge.core.fence import Fence
 from edge.flight.margins import ErrorBudget
-from edge.messages.mission import FlightState, GroundState, Place, RobotStatus
+from edge.messages.mission import GroundState, Place, RobotStatus
 
 # A robot without a status for longer is stale.
 FRESH_S = 2.0
@@ -116,7 +116,7 @@ class GroundEvent:
     """An event: a command, one of its results, a robot's new state, or a new commander.
 
     `robot` is a name, "" for the fleet; `operator` gave the command, "" if there was none. `trial`
-    is the mission's name at the time, `state` a robot's new state.
+    is the mission's name at the time.
     """
 
     unix_time_s: float
@@ -125,7 +125,6 @@ class GroundEvent:
     text: str
     operator: str = ""
     trial: str = ""
-    state: FlightState | None = None
 
 
 @dataclass(frozen=True, slots=True)

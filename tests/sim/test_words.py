@@ -197,7 +197,7 @@ def commanded() -> list[object]:
         station.hear_status(lacking)
         told.append(station.published_world())
     assert told[-2:] == [OTHER_WORLD, None]
-    events = [(e.kind, e.robot, e.operator, e.trial, e.state) for e in field.events[began:]]
+    events = [(e.kind, e.robot, e.operator, e.trial) for e in field.events[began:]]
     return [*told, *events, [robot.state for robot in field.robots]]
 
 

@@ -162,7 +162,7 @@ class HeardRobots:
         if before is not None and before.boot_nonce != status.boot_nonce:
             self._tell("presence", robot.name, "its program has started again")
         if before is None or (before.state, before.reason) != (status.state, status.reason):
-            self._tell("state", robot.name, state_and_reason(status), state=status.state)
+            self._tell("state", robot.name, state_and_reason(status))
         self._look_at(robot)
         return True
 

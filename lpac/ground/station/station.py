@@ -162,14 +162,11 @@ class Station:
 
     # Events
 
-    def tell(
-        self, kind: EventKind, robot: str, text: str, operator: str = "",
-        state: FlightState | None = None,
-    ) -> None:  # fmt: skip
+    def tell(self, kind: EventKind, robot: str, text: str, operator: str = "") -> None:
         """Keep an event for the clients."""
         trial = "" if self.state is None else self.state.trial
         unix_now_s = self._robots.unix_now_s
-        event = GroundEvent(unix_now_s, kind, robot, text, operator, trial, state)
+        event = GroundEvent(unix_now_s, kind, robot, text, operator, trial)
         self._events.append(event)
         self._new_events.append(event)
 

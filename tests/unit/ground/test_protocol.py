@@ -13,7 +13,6 @@ from edge.core.world import MOST_FEATURES, format_world, random_features
 from edge.messages.codec import MessageError
 from edge.messages.codes import RefusalCode
 from edge.messages.mission import (
-    FlightState,
     GroundState,
     Place,
     explored_from_bytes,
@@ -70,7 +69,7 @@ TOLD: tuple[ServerMessage, ...] = (
           "Uniform 0 0\n", "abc", "bundle", 512, 64, 128.0, 16.0, 2.0, 1.0),
     FleetSnapshot(1e9, "me", GroundState(4, "me", ORIGIN, robot_safety_actions={"1": "hold"}),
             (robot(status(1)), RobotSnapshot("r2", 2)), ("takeoff",), 0.4),
-    GroundEvent(1e9, "state", "r1", "hold: ground commands hold", "me", "t1", FlightState.HOLD),
+    GroundEvent(1e9, "state", "r1", "hold: ground commands hold", "me", "t1"),
     Explored("r1", base64.b64encode(bytes(512)).decode()),
     CommandProgress("r1", "takes off"),
     CommandReport(
