@@ -319,10 +319,12 @@ def lock(directory: str, who: str, mavlink_port: int) -> Result:
     return {"recovered": _recover(directory, mavlink_port)}
 
 
-def require_lock() -> None:
+@call
+def require_lock() -> Result:
     """Raises Refused if this session does not hold the robot."""
     if not _lock:
         raise Refused("lock was not called")
+    return {}
 
 
 @call

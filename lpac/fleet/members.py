@@ -1,18 +1,32 @@
 """The fleet's members: robots, whose keys stay on them, and ground stations."""
 
 import base64
+import hashlib
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from edge.core.schema import ConfigError
-from edge.drivers.identity_folder import AUTHORITY_PEM, GROUP_KEYS, MEMBERS, read_members
-from edge.identity.members import Member, Role
+from edge.drivers.identity_folder import (
+    AUTHORITY_PEM,
+    GROUP_KEYS,
+    KEY_PEM,
+    MEMBERS,
+    read_members,
+)
+from edge.identity.members import Member, Role, parse_members
 from lpac.fleet.authority import Authority, AuthorityError, create_authority, new_member
 from lpac.fleet.hold import Report, hold, visit
-from lpac.fleet.program import restart
-from lpac.fleet.session import Session
+from lpac.fleet.program import require_disarmed, restart
+from lpac.fleet.session import RemoteError, Session
 from lpac.fleet.settings import FleetConfig, RobotHost
+
+# As `edge.drivers.identity_folder` reads it; the program sees it below /var/lib/lpac. The names
+# are as systemd makes them for a DynamicUser=.
+_IDENTITY, _NEXT_KEY = "/var/lib/private/lpac/identity", "next-key.pem"
+# For the program's user, who owns the folder around, or will when it starts first.
+_OWN = "chown -R --no-dereference --reference=.."
 
 
 class Joined(NamedTuple):
@@ -56,11 +70,11 @@ async def join(
         return Joined(None, None)
     new = None if config.keys.exists() else config.keys
     authority = open_authority(config) if new is None else init(config, operator())
-    found = await session.call("identity_key", fresh=False)
-    public_key = bytes.fromhex(found["public_key"])
+    public_key = await _public_key(session, fresh=False)
     member = Member(Role.ROBOT, robot.name, robot.robot_id, public_key)
     files = authority.files(member)
-    if member in authority.members.members and found["authority"] == _text(files[AUTHORITY_PEM]):
+    knows = (await _digests(session)).get(AUTHORITY_PEM) == _sha256(files[AUTHORITY_PEM])
+    if member in authority.members.members and knows:
         await bring_members(session, config)
         return Joined("was so already", new)
     issued = authority.issue(Role.ROBOT, robot.name, public_key, robot.robot_id)
@@ -75,7 +89,7 @@ async def renew_key(config: FleetConfig, robot: RobotHost, report: Report) -> No
     """
     authority = open_authority(config)
     async with hold(config, robot, report) as (session, found, _):
-        made = bytes.fromhex((await session.call("identity_key", fresh=True))["public_key"])
+        made = await _public_key(session, fresh=True)
         issued = authority.issue(
             Role.ROBOT, robot.name, made, robot.robot_id, renew_group_key=False
         )
@@ -97,12 +111,25 @@ async def bring_members(session: Session, config: FleetConfig) -> str | None:
     except ValueError as error:
         raise ConfigError(f"{config.keys}: {error}") from None
     files = {
-        name: _text((config.keys / name).read_bytes())
+        name: (config.keys / name).read_bytes()
         for name in (GROUP_KEYS, MEMBERS)
         if (config.keys / name).exists()
     }
-    brought = await session.call("set_members", files=files, number=number)
-    return f"it was given the list of members {number}" if brought["changed"] else None
+    digests = await _digests(session)
+    if MEMBERS not in digests:
+        raise RemoteError("it has no key of the fleet: run `lpac fleet enroll`")
+    is_same = digests[MEMBERS] == _sha256(files[MEMBERS])
+    known = await _list_number(session)
+    if known > number or (known == number and not is_same):
+        raise RemoteError(
+            f"its list of members is number {known}, and this computer's {number} is not newer: "
+            "bring `members` from the computer that changed it"
+        )
+    changed = {name: data for name, data in files.items() if digests.get(name) != _sha256(data)}
+    if not changed:
+        return None
+    await session.must("sh", "-c", _written(changed))
+    return f"it was given the list of members {number}"
 
 
 async def bring_members_to(config: FleetConfig, robot: RobotHost, report: Report) -> None:
@@ -114,9 +141,58 @@ async def bring_members_to(config: FleetConfig, robot: RobotHost, report: Report
 async def _write_member(
     session: Session, robot: RobotHost, files: dict[str, bytes], *, fresh: bool
 ) -> None:
-    texts = {name: _text(data) for name, data in files.items()}
-    await session.call("set_member", files=texts, fresh=fresh, mavlink_port=robot.mavlink_port)
+    """Write what belongs to the key, `fresh` or not. The robot's program reads it when it starts.
+
+    In one call, which is carried out though the laptop has gone.
+    """
+    await session.call("require_lock")
+    await require_disarmed(session, robot, "a new key")
+    await session.must("sh", "-c", _written(files, f"mv {_NEXT_KEY} {KEY_PEM}" if fresh else ""))
 
 
-def _text(data: bytes) -> str:
-    return base64.b64encode(data).decode()
+async def _public_key(session: Session, *, fresh: bool) -> bytes:
+    """The public key of the robot, whose secret key is made there and never leaves.
+
+    With `fresh` it is another one than before, which counts once `_write_member` brings the rest.
+    """
+    key = _NEXT_KEY if fresh else KEY_PEM
+    pem = await session.must("sh", "-c", f"""set -eC; umask 077; mkdir -p {_IDENTITY}
+cd {_IDENTITY}; if [ {int(fresh)} = 1 ] || [ ! -e {key} ]; then
+    rm -f part; openssl genpkey -algorithm ed25519 > part; sync part; mv part {key}
+fi
+{_OWN} .; openssl pkey -in {key} -pubout""")  # fmt: skip
+    der = base64.b64decode("".join(pem.strip().splitlines()[1:-1]))
+    # An Ed25519 key is the last 32 bytes of its DER (RFC 8410).
+    return der[-32:]
+
+
+async def _digests(session: Session) -> dict[str, str]:
+    """The sha256 of each file of the robot's identity, in hexadecimal."""
+    said = (await session.look({"": f"cd {_IDENTITY} && sha256sum *"}))[""]
+    return {line[66:]: line[:64] for line in said.splitlines()}
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+async def _list_number(session: Session) -> int:
+    """The number of the robot's list; 0 of one that its program does not take up either."""
+    try:
+        text = await session.must("cat", f"{_IDENTITY}/{MEMBERS}")
+        return parse_members(text).number
+    except ValueError:
+        return 0
+
+
+def _written(files: dict[str, bytes], first: str = "") -> str:
+    """The shell's commands that write files of the identity, each whole or not at all.
+
+    Also where the program's user, whose folder it is, has put a link there for root to follow.
+    """
+    lines = [f"set -eC; umask 077; cd {_IDENTITY}", first]
+    for name, data in files.items():
+        text = base64.b64encode(data).decode()
+        lines.append(f"rm -f part; echo {text} | base64 -d > part; {_OWN} part; sync part")
+        lines.append(f"mv part {shlex.quote(name)}")
+    return "\n".join(lines)

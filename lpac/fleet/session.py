@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 from edge.drivers.px4 import raw_mavlink
 from lpac.fleet import agent
-from lpac.fleet.on_robot import enrolment
 from lpac.fleet.settings import FleetConfig, RobotHost
 
 Say = Callable[[str], None]
@@ -224,7 +223,7 @@ async def connect(
     config: FleetConfig, robot: RobotHost, say: Say = lambda _: None
 ) -> AsyncIterator[Session]:
     """A session; `say` hears how far calls are. Raises UnreachableError."""
-    modules = (raw_mavlink, agent, enrolment)
+    modules = (raw_mavlink, agent)
     sources = [(m.__name__, Path(str(m.__file__)).read_text("utf-8")) for m in modules]
     payload = json.dumps(sources).encode()
     # Python 3.6 would take the robot's texts for ASCII.

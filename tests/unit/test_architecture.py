@@ -247,7 +247,7 @@ def test_a_class_name_means_one_thing() -> None:
 
 
 def test_what_runs_on_the_robots_own_python_is_one_file() -> None:
-    """All else of `lpac.fleet` is commands over SSH, and runs on the laptop; keys come next."""
-    fleet = ROOT / "lpac" / "fleet"
-    assert len((fleet / "agent.py").read_text().splitlines()) <= 500
-    assert {path.name for path in fleet.glob("on_robot/*.py")} <= {"__init__.py", "enrolment.py"}
+    """All else of `lpac.fleet` is commands over SSH, and runs on the laptop."""
+    assert len((ROOT / "lpac" / "fleet" / "agent.py").read_text().splitlines()) <= 500
+    text = (ROOT / "lpac" / "fleet" / "session.py").read_text()
+    assert "modules = (raw_mavlink, agent)" in text

@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from lpac.fleet import probes, up
+from lpac.fleet import agent, members, probes, up
+from lpac.fleet.settings import load_fleet
+from tests.conftest import ROOT
 from tests.local_session import LocalSession
+from tests.needs import needs
 
 
 def test_this_machine_can_be_looked_at(tmp_path: Path) -> None:
@@ -44,3 +47,37 @@ def test_a_tool_that_hangs_holds_nothing_up() -> None:
     commands = {"before": "echo a; echo b >&2", "hung": "echo c; sleep 60", "after": 'echo "d\'"'}
     found = asyncio.run(LocalSession().look(commands, each_s=0.5))
     assert found == {"before": "a", "hung": "c", "after": "d'"}
+
+
+@needs("openssl")
+def test_a_robots_key_is_made_on_it_and_replaced_with_what_belongs_to_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder, others = tmp_path / "lpac" / "identity", tmp_path / "others"
+    monkeypatch.setattr(members, "_IDENTITY", str(folder))
+    monkeypatch.setattr(agent, "_lock", [0])
+    monkeypatch.setattr(agent, "armed", lambda _: False)
+    robot = load_fleet(ROOT / "docs" / "fleet.toml").robots["r1"]
+    session = LocalSession()
+
+    def public_key(*, fresh: bool) -> bytes:
+        return asyncio.run(members._public_key(session, fresh=fresh))
+
+    first = public_key(fresh=False)
+    key = (folder / "key.pem").read_bytes()
+    assert (folder / "key.pem").stat().st_mode & 0o777 == 0o600
+    assert first == public_key(fresh=False)
+    second = public_key(fresh=True)
+    assert second != first and (folder / "key.pem").read_bytes() == key
+    # The program's user may have put a link there for root to follow.
+    others.write_text("theirs")
+    (folder / "part").symlink_to(others)
+    data = os.urandom(5000)
+    files = {"certificate.pem": data, "authority.pem": b""}
+    asyncio.run(members._write_member(session, robot, files, fresh=True))
+    assert public_key(fresh=False) == second
+    assert others.read_text() == "theirs" and (folder / "certificate.pem").read_bytes() == data
+    assert {path.name for path in folder.iterdir()} == {"key.pem", *files}
+    assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {0o600}
+    digests = asyncio.run(members._digests(session))
+    assert digests["certificate.pem"] == members._sha256(data)

@@ -14,10 +14,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from edge.drivers.px4 import raw_mavlink
-from lpac.fleet import agent, deploy, program, pull, setup, up
+from lpac.fleet import agent, deploy, members, program, pull, setup, up
 from lpac.fleet.agent import Refused, write_whole
 from lpac.fleet.hold import Held, earlier_than
-from lpac.fleet.on_robot import enrolment
 from lpac.fleet.release import Image, Release, _entry
 from lpac.fleet.session import Done, RemoteError
 from lpac.fleet.settings import load_fleet
@@ -27,7 +26,7 @@ from tests.local_session import LocalSession
 
 @pytest.mark.parametrize(
     "path",
-    [Path(str(module.__file__)) for module in (agent, enrolment, raw_mavlink)],
+    [Path(str(module.__file__)) for module in (agent, raw_mavlink)],
     ids=lambda path: path.name,
 )
 def test_the_robots_python_3_6_can_read_it(path: Path) -> None:
@@ -134,10 +133,6 @@ def test_the_programs_word_counts_while_it_has_the_vehicle(
 CONFIG = load_fleet(ROOT / "docs" / "fleet.toml")
 R1 = CONFIG.robots["r1"]
 PORT = R1.mavlink_port
-NEEDS_LOCK: tuple[Callable[[str], object], ...] = (
-    lambda folder: agent.switch(folder, "1", PORT),
-    lambda folder: enrolment.set_member({}, False, PORT),
-)
 
 
 class Robot(LocalSession):
@@ -203,18 +198,21 @@ def test_a_robot_in_flight_is_left_as_it_is(
     assert not robot.changed
 
 
-@pytest.mark.parametrize("ask", NEEDS_LOCK)
 def test_a_robot_that_flies_or_is_not_held_keeps_what_it_has(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ask: Callable[[str], object]
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(enrolment, "_MEMBERSHIP", str(tmp_path / "identity"))
-    with pytest.raises(Refused, match="lock was not called"):
-        ask(str(tmp_path))
+    def refused(why: str) -> None:
+        robot = Robot()
+        with pytest.raises(Refused, match=why):
+            agent.switch(str(tmp_path), "1", PORT)
+        with pytest.raises(RemoteError, match=why):
+            asyncio.run(members._write_member(robot, R1, {}, fresh=False))
+        assert not robot.changed and not list(tmp_path.iterdir())
+
+    refused("lock was not called")
     monkeypatch.setattr(agent, "armed", lambda _: True)
     monkeypatch.setattr(agent, "_lock", [0])
-    with pytest.raises(Refused, match="the vehicle is armed"):
-        ask(str(tmp_path))
-    assert not list(tmp_path.iterdir())
+    refused("the vehicle is armed")
 
 
 @pytest.mark.parametrize(
