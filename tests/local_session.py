@@ -7,7 +7,7 @@ from lpac.fleet.session import RemoteError, Session
 
 
 class LocalSession(Session):
-    """What the laptop asks of a robot is done here."""
+    """Session whose robot is this process."""
 
     def __init__(self) -> None:
         """No process: nothing is to be closed."""

@@ -269,22 +269,22 @@ Finding = tuple[Verdict, str, str]
 
 
 def ok(found: str) -> Finding:
-    """What was looked at is well."""
+    """Finding of a check that is well."""
     return "ok", found, ""
 
 
 def skipped(found: str) -> Finding:
-    """What cannot be looked at, or is not there."""
+    """Finding of a check of something that is not there, or cannot be looked at."""
     return "skipped", found, ""
 
 
 def warning(found: str, fix: str) -> Finding:
-    """What does not keep a robot from flying."""
+    """Finding that does not keep a robot from flying."""
     return "warning", found, fix
 
 
 def failed(found: str, fix: str) -> Finding:
-    """What keeps a robot from flying."""
+    """Finding that keeps a robot from flying."""
     return "FAILED", found, fix
 
 
@@ -670,7 +670,7 @@ def _why_suspect(container: Facts, predecessors: Sequence[str]) -> str:
 
 
 def _failed_checks(its: _Judged) -> tuple[list[FailedCheck], bool] | str:
-    """What keeps the vehicle from taking off, and whether that is all; or why it is not known."""
+    """Failed checks of the vehicle, and whether these are all; or why they are not known."""
     if its.service["fresh"]:
         status = its.service["status"]
         return _told(status["failed_checks"]), status["failed_checks_more"] == 0
@@ -704,7 +704,7 @@ def _failsafe(its: _Judged) -> Finding:
 
 
 def _preflight(its: _Judged) -> Finding:
-    """What else keeps the vehicle from taking off."""
+    """Other reasons that keep the vehicle from taking off."""
     known = _failed_checks(its)
     if isinstance(known, str):
         return skipped(known)

@@ -166,7 +166,7 @@ class Session:
         return done.out
 
     async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
-        """What shell commands print, by name, without complaints; in one call.
+        """Output of shell commands, by name, without complaints; in one call.
 
         One that does not end in `each_s` has printed what it had by then.
         """

@@ -39,12 +39,12 @@ class EnrolStep(NamedTuple):
 
 
 def wanted_identity(config: FleetConfig, robot: RobotHost) -> dict[str, object]:
-    """Who the robot is to be, as it is written on it."""
+    """Identity that the robot is to have, as it is written on it."""
     return {"fleet": config.fleet, "robot": robot.name, "robot_id": robot.robot_id}
 
 
 def former_identity(found: dict[str, Any] | None, wanted: dict[str, object]) -> str | None:
-    """Who a robot was until now, None if nobody else."""
+    """Former identity of a robot, in words; None if it had no other."""
     if found in (None, wanted):
         return None
     return "{} of fleet {} (id {})".format(*map(found.get, ("robot", "fleet", "robot_id")))

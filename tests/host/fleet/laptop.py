@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 class Laptop:
-    """What an operator has: fleet.toml as it is now, and the releases made from it."""
+    """An operator's files: fleet.toml as it is now, and the releases made from it."""
 
     def __init__(self, hosts: FrailHosts, folder: Path) -> None:
         self.hosts = hosts
@@ -41,7 +41,7 @@ class Laptop:
         return asyncio.run(deploy(self.config, self.robot(index), release, report))
 
     def ask(self, index: int, question: Callable[[Session, RobotHost], Awaitable[T]]) -> T:
-        """What comes of it in a session."""
+        """Answer to a question in a session."""
 
         async def one() -> T:
             robot = self.robot(index)
@@ -51,7 +51,7 @@ class Laptop:
         return asyncio.run(one())
 
     def overview(self, index: int) -> dict[str, Any]:
-        """What the robot has; a busy machine may hold up for a moment what its program says."""
+        """Overview of the robot; a busy machine may hold up for a moment what its program says."""
         until_s = time.monotonic() + 60.0
         while True:
             found = self.ask(index, lambda session, _: overview(session, self.config))

@@ -1,4 +1,4 @@
-"""What runs on the robot, as far as it needs no robot and no root."""
+"""The robot's agent, and what is asked of it, as far as that needs no robot and no root."""
 
 import ast
 import asyncio

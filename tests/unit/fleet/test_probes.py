@@ -1,4 +1,4 @@
-"""What the robot's tools print, parsed: any numbers and names, cut off anywhere."""
+"""Output of the robot's tools, parsed: any numbers and names, cut off anywhere."""
 
 import asyncio
 import dataclasses
