@@ -60,13 +60,13 @@ async def deploy(
                 f"it is {before['machine']}, and the image is for {release.image.machine}: "
                 f"make image ARCH={'arm64' if before['machine'] == 'aarch64' else 'amd64'}"
             )
+        await require_disarmed(session, robot, "deploying")
         spare = config.slot_of(robot.name) is None
         runs = spare or before["service"]["fresh"]
         if before["current"] == release.id and before["pending"] is None and runs:
             report("check", None)
             if await _is_whole(session, f"{config.directory}/current/"):
                 return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
-        await require_disarmed(session, robot, "deploying")
         incoming = f"{config.directory}/incoming/{release.id}"
         kept = await _make_room(session, config, release, before, incoming)
         like = [f"--link-dest={config.directory}/releases/{name}" for name in kept]
