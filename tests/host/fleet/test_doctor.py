@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from lpac.fleet.doctor import (
     diagnose,
     examine,
 )
-from lpac.fleet.members import open_authority
+from lpac.fleet.members import bring_members_to, open_authority
 from lpac.fleet.operations import Outcome, for_each
 from lpac.fleet.settings import RobotHost, load_fleet
 from lpac.fleet.up import bring_up
@@ -35,6 +36,10 @@ def enrolled(hosts: FrailHosts) -> FrailHosts:
         host.reset()
     for host in hosts:
         name_robot(hosts, host)
+    config = load_fleet(hosts.fleet_toml)
+    # The first have the list from before the others joined.
+    bring = partial(bring_members_to, config, report=unwatched)
+    assert not [o for o in asyncio.run(for_each([*config.robots.values()], bring)) if o.problem]
     return hosts
 
 
