@@ -56,9 +56,8 @@ class Variant:
 class AblationConfig:
     """The file. `base` is the path of a training's configuration, relative to the file.
 
-    `train` is merged into that configuration. `fly` has keys of a study's condition, for the base
-    and all variants. Each is trained with each of `seeds`, and flown over `worlds` worlds in
-    `set_up`.
+    `train` is merged into that configuration. `fly` has keys of a study's condition. Base and
+    variants are trained with each of `seeds`, and flown over `worlds` worlds in `set_up`.
     """
 
     base: str

@@ -98,8 +98,7 @@ class _Messages:
         values = {
             name: _column([rows.get(k) for k in range(count)]) for name, rows in self._rows.items()
         }
-        # A value that is a mapping in some messages and None in others only has the mapping's
-        # columns.
+        # A value that is a mapping in some messages and None in others has the mapping's columns.
         whole = {
             name
             for name, rows in self._rows.items()

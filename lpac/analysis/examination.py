@@ -157,9 +157,8 @@ class _Worlds:
             if mission.begin_s <= status.time_s <= mission.end_s
         ]
         world = self._without_text(mission, {s.bundle_id for s in statuses})
-        return self._coverage(
-            mission, sorted({s.world_id for s in statuses}), world
-        ), world.sensor_size
+        flown = sorted({s.world_id for s in statuses})
+        return self._coverage(mission, flown, world), world.sensor_size
 
     def _coverage(self, mission: Mission, flown: list[str], world: _World) -> Coverage | None:
         if len(flown) > 1:
@@ -244,8 +243,7 @@ def _notes(logs: Logs, record: FlightRecord, wanted: Wanted) -> Iterable[str]:
     silent = [
         robot.name
         for robot in record.robots
-        if not {(robot.robot_id, status.boot_nonce) for status in robot.statuses}
-        & logs.programs_logged
+        if not {(robot.robot_id, s.boot_nonce) for s in robot.statuses} & logs.programs_logged
     ]
     if silent:
         robots = "any robot" if len(silent) == len(record.robots) else ", ".join(silent)

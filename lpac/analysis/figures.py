@@ -239,9 +239,8 @@ def messages(flight: FlightRecord, received: Messages) -> Figure:
         middles_s = (edges_s[1:] + edges_s[:-1]) / 2.0
         bins = np.digitize(received.heard_at_s, edges_s) - 1
         for share, dashes, name in ((0.5, "-", "median"), (0.95, "--", "95th percentile")):
-            values = [
-                quantile(received.heard_age_s[bins == b], share) for b in range(len(middles_s))
-            ]
+            ages_s = (received.heard_age_s[bins == b] for b in range(len(middles_s)))
+            values = [quantile(each_s, share) for each_s in ages_s]
             left.plot(middles_s, 1e3 * np.array(values), color=style.BLUE, ls=dashes, label=name)
         left.set(ylabel="message age (ms)")
         left.legend(loc="upper right", ncols=2)

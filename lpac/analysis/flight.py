@@ -148,10 +148,9 @@ class FirstAlarm(NamedTuple):
 class Messages:
     """Messages between a mission's robots, during the mission.
 
-    `age_s` and `loss` (N, N), [receiver, sender], are the median age, and the share lost between
-    the first and the last received message; NaN where none was received. `heard_at_s` and
-    `heard_age_s` (M,) are time and age of all received messages, s. `gaps` (G, 2) are times of
-    messages before which some were lost, and their number.
+    `age_s` and `loss` (N, N), [receiver, sender]: median age, and share lost between the first and
+    the last reception; NaN without any. `heard_at_s` and `heard_age_s` (M,) are times and ages of
+    all receptions, s. `gaps` (G, 2): time of a reception, and number of messages lost before it.
     """
 
     age_s: F64
@@ -222,9 +221,8 @@ class ScriptRecord:
 
     The script started at `start_s` of the record's times. `began_s` has the start of each step, s
     from then; its last entry, `end`, is the end of the flight. `problem` is the reason of an early
-    end, or None. `launcher` is the CPU use (share of a core) and memory (MB) of the ground's and
-    the simulated vehicles' processes. `vehicles_behind_s` and `robots_behind_s` are lags behind
-    real time.
+    end, or None. `launcher` is the CPU use (share of a core) and memory (MB) of ground and vehicle
+    processes. `vehicles_behind_s` and `robots_behind_s` are lags behind real time.
     """
 
     vehicle: str = ""
@@ -509,14 +507,12 @@ class FlightRecord:
         return seen
 
 
-def changes_of(
-    times_s: Sequence[float], statuses: Sequence[LoggedStatus]
-) -> tuple[StateChange, ...]:
+def changes_of(times_s: Sequence[float], logged: Sequence[LoggedStatus]) -> tuple[StateChange, ...]:
     """State changes in a robot's statuses, with reasons."""
     return tuple(
         StateChange(time_s, status.state, status.reason)
-        for k, (time_s, status) in enumerate(zip(times_s, statuses, strict=True))
-        if k == 0 or status.state is not statuses[k - 1].state
+        for k, (time_s, status) in enumerate(zip(times_s, logged, strict=True))
+        if k == 0 or status.state is not logged[k - 1].state
     )
 
 

@@ -344,8 +344,7 @@ class _LogReader:
                 logs.clocks_known.add(program)
             ahead_s[program] = own_s - starts_s[program]
             logs.statuses.setdefault(program[0], []).extend(
-                replace(status, time_s=starts_s[program] + status.time_s)
-                for status in statuses.values()
+                replace(s, time_s=starts_s[program] + s.time_s) for s in statuses.values()
             )
         for robot_statuses in logs.statuses.values():
             robot_statuses.sort(key=lambda status: status.time_s)

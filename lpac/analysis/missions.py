@@ -129,12 +129,8 @@ def _record(
         _robot(robot, logs.name(robot), logs.statuses.get(robot, []), begin_s, from_s, to_s)
         for robot in mission.robots
     )
-    fences = [
-        status.fence for robot in robots for status in robot.statuses if status.fence is not None
-    ]
-    programs = {
-        (robot.robot_id, status.boot_nonce) for robot in robots for status in robot.statuses
-    }
+    fences = [s.fence for robot in robots for s in robot.statuses if s.fence is not None]
+    programs = {(robot.robot_id, s.boot_nonce) for robot in robots for s in robot.statuses}
     clocks_known = programs <= logs.clocks_known
     return FlightRecord(
         name=mission.name,
@@ -291,9 +287,7 @@ def _lateness(
             if 0.0 <= time_s <= duration_s
         ]
         for loop in LOOPS:
-            known = [
-                (time_s, status.loops[loop]) for time_s, status in during if loop in status.loops
-            ]
+            known = [(time_s, s.loops[loop]) for time_s, s in during if loop in s.loops]
             if known:
                 found[loop][robot.name] = LoopLateness(
                     time_s=np.array([time_s for time_s, _ in known]),

@@ -173,9 +173,7 @@ def what_would_tell(difference: Interval95, worlds: int) -> str:
     if not abs(value) > 0.001 * width:
         return f"no difference is visible over {worlds} worlds"
     enough = max(worlds + 1, math.ceil(worlds * (width / abs(value)) ** 2))
-    return (
-        f"{worlds} worlds are too few to show this difference; about {enough} would, if it is real"
-    )
+    return f"{worlds} worlds are too few for this difference; about {enough} would show it"
 
 
 def performance_profile(values: F64, thresholds: F64) -> F64:

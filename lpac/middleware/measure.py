@@ -110,10 +110,7 @@ class MiddlewareFleet:
             robot.program.send("start", middleware, robots, start)
 
     def meet(self, robots: int, start: int) -> bool:
-        """Wait until all programs of that start have received from each other. Raises OSError.
-
-        Returns False after a timeout.
-        """
+        """Wait until all programs have met; False after a timeout. Raises OSError."""
         pairs = robots * (robots - 1)
 
         def met() -> bool:

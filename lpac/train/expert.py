@@ -23,11 +23,10 @@ Indices = npt.NDArray[np.intp]
 
 # Period of an expert's observations, s.
 LOOK_PERIOD_S = 0.5
-# Parameters of the exploring expert, in model units: pitch of its lattice; distance over which the
-# weight of an unseen cell falls by 1/e; distance of the goal if all unseen cells are in one
-# direction. In eight training worlds of the field it ended at 0.256 of the initial cost
-# (clairvoyant 0.263), and had 0.32 after 20 s. A decay of 32 gave 0.56 after 20 s; a decay of 12
-# left distant areas unexplored (0.39).
+# Of the exploring expert, in model units: pitch of its lattice; distance that lowers an unseen
+# cell's weight to 1/e; distance of the goal if all unseen cells are in one direction. In eight
+# training worlds of the field it ended at 0.256 of the initial cost (clairvoyant 0.263), and had
+# 0.32 after 20 s (0.56 with a decay of 32). A decay of 12 left distant areas unexplored (0.39).
 _PITCH = 8
 _DECAY = 18.0
 _STEP = 24.0

@@ -58,8 +58,7 @@ class States:
 
     `inputs` (R, ...) by name, images as float16; `velocities` (R, 2) are the expert's, in model
     units/s; `robots` (S,) is the number of robots of each state, and `adjacency` (sum of their
-    squares,) which of them are in range, row by row. `largest_payload` is the flights' largest
-    number in a payload.
+    squares,) which of them are in range, row by row. `largest_payload` is the flights' maximum.
     """
 
     inputs: dict[str, npt.NDArray[np.floating]]
@@ -251,9 +250,7 @@ class _MixedAgents:
             if self._by_expert[self._world_of[agent]]:
                 by_expert.setdefault(self._world_of[agent], []).append(i)
         for world, its in by_expert.items():
-            velocities[its] = self._expert_velocities(
-                world, [self._robot_of[robots[i]] for i in its]
-            )
+            velocities[its] = self._imitated(world, [self._robot_of[robots[i]] for i in its])
         return PolicySteps(velocities, payloads_out)
 
     def reset(self, robot: int) -> None:
@@ -262,7 +259,7 @@ class _MixedAgents:
     def _by_policy(self, robots: Sequence[int]) -> list[int]:
         return [i for i, agent in enumerate(robots) if not self._by_expert[self._world_of[agent]]]
 
-    def _expert_velocities(self, world: int, robots: Sequence[int]) -> F64:
+    def _imitated(self, world: int, robots: Sequence[int]) -> F64:
         """The expert's velocities for these robots at the present positions."""
         swarm, scenario = self._flights.swarms[world], self._flights.prepared[world].scenario
         return self._experts[world].velocities(

@@ -144,7 +144,7 @@ def test_how_many_worlds_would_tell() -> None:
     assert few == "2 worlds are too few: at least 6 are needed, often 50"
     # Four times the number halves the interval, which then ends at 0.
     some = what_would_tell(Interval95(0.1, -0.1, 0.3), 20)
-    assert some.endswith("about 80 would, if it is real")
+    assert some.endswith("about 80 would show it")
     assert "no difference is visible" in what_would_tell(Interval95(0.0, -0.1, 0.1), 20)
     rng = np.random.default_rng(1)
     a, b = rng.normal(0.0, 1.0, (1, 20)), rng.normal(0.2, 1.0, (1, 20))
