@@ -251,14 +251,6 @@ def _notes(logs: Logs, record: FlightRecord, wanted: Wanted) -> Iterable[str]:
             f"{record.name}: no log of {robots}: the messages that arrived there are unknown; the "
             "rest is from the ground's log"
         )
-    messages = record.messages
-    if messages is not None and not record.clocks_known and len(messages.heard_age_s):
-        low_s, high_s = messages.age_quantile_s(0.0), messages.age_quantile_s(0.5)
-        if low_s < -0.05 or high_s > 2.0:
-            yield (
-                f"{record.name}: message ages and times between robots are wrong: the robots' "
-                "clocks differ, and there is no ground log to correct them"
-            )
 
 
 def _values(record: FlightRecord) -> dict[str, Any]:
@@ -304,7 +296,6 @@ def _values(record: FlightRecord) -> dict[str, Any]:
             "loss_share": finite(messages.loss_share),
             "age_p50_s": finite(messages.age_quantile_s(0.5)),
             "age_p99_s": finite(messages.age_quantile_s(0.99)),
-            "ages_corrected": record.clocks_known,
         },
         "loops": {
             loop: {

@@ -76,8 +76,9 @@ class LoggedStatus:
 class Received:
     """Messages received by one robot, in order: (M,) each.
 
-    `time_s` is on the common clock, and `age_s` corrected by it. If a message could not be decoded,
-    `sequence` is -1 and `age_s` NaN. `accepted` is 1 where the message was used.
+    `time_s` is on the common clock. `age_s` is the greatest possible age by the fleet's clock, NaN
+    if it was not known. If a message could not be decoded, `sequence` is -1. `accepted` is 1 where
+    the message was used.
     """
 
     time_s: F64
@@ -348,7 +349,7 @@ class _LogReader:
             )
         for robot_statuses in logs.statuses.values():
             robot_statuses.sort(key=lambda status: status.time_s)
-        self._sort_received(starts_s, ahead_s)
+        self._sort_received(ahead_s)
         orders = (
             order._replace(time_s=order.time_s - ahead_s.get(program, 0.0))
             for program, order in self._orders
@@ -403,21 +404,11 @@ class _LogReader:
 
         return to_mission
 
-    def _sort_received(
-        self, starts_s: Mapping[Program, float], ahead_s: Mapping[Program, float]
-    ) -> None:
-        # A message names its sender, not the sender's program: take the one that ran at that time.
-        began: dict[int, list[tuple[float, float]]] = defaultdict(list)
-        for program, start_s in sorted(starts_s.items(), key=lambda item: item[1]):
-            began[program[0]].append((start_s, ahead_s[program]))
+    def _sort_received(self, ahead_s: Mapping[Program, float]) -> None:
         columns: dict[int, list[tuple[float, ...]]] = defaultdict(list)
         for program, messages in self._received.items():
             own_s = ahead_s.get(program, 0.0)
-            for at_s, sender, sequence, own_age_s, accepted in messages:
-                time_s = at_s - own_s
-                senders = [a for start_s, a in began[sender] if start_s <= time_s]
-                age_s = own_age_s - own_s + (senders[-1] if senders else 0.0)
-                columns[program[0]].append((time_s, sender, sequence, age_s, accepted))
+            columns[program[0]] += [(at_s - own_s, *rest) for at_s, *rest in messages]
         for robot_id, rows in columns.items():
             ordered = np.array(sorted(rows), np.float64).T
             self._logs.received[robot_id] = Received(*ordered)

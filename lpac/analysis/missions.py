@@ -25,6 +25,7 @@ from lpac.analysis.flight import (
     LoopLateness,
     Messages,
     RobotRecord,
+    quantile,
 )
 from lpac.analysis.logs import (
     LoggedStatus,
@@ -145,7 +146,7 @@ def _record(
         cost_time_s=cost_time_s,
         fence=fences[-1] if fences else configured_fence,
         commands=_commands(logs, mission, from_s, to_s),
-        messages=_messages(logs, mission, clocks_known),
+        messages=_messages(logs, mission),
         lateness=_lateness(robots, duration_s),
         world_ids=tuple(sorted({status.world_id for robot in robots for status in robot.statuses})),
         clocks_known=clocks_known,
@@ -235,7 +236,7 @@ def _commands(logs: Logs, mission: Mission, from_s: float, to_s: float) -> tuple
     return tuple(command for command in commands if from_s <= command.time_s <= to_s)
 
 
-def _messages(logs: Logs, mission: Mission, clocks_known: bool) -> Messages | None:
+def _messages(logs: Logs, mission: Mission) -> Messages | None:
     robots = mission.robots
     if not any(robot in logs.received for robot in robots):
         return None
@@ -252,12 +253,11 @@ def _messages(logs: Logs, mission: Mission, clocks_known: bool) -> Messages | No
             if not own.any():
                 continue
             times_s = received.time_s[own] - mission.begin_s
-            # Clocks are corrected to a few ms only, but no age is negative.
-            ages_s = received.age_s[own].clip(min=0.0 if clocks_known else -math.inf)
+            ages_s = received.age_s[own]
             missing = _missing(received, own)
             arrivals.append(np.stack([times_s, ages_s], axis=1))
             gaps.append(np.stack([times_s[1:], missing], axis=1)[missing > 0])
-            age_s[row, column] = np.median(ages_s)
+            age_s[row, column] = quantile(ages_s, 0.5)
             loss[row, column] = missing.sum() / (missing.sum() + own.sum())
     all_received = np.concatenate([np.zeros((0, 2)), *arrivals])
     return Messages(
