@@ -16,6 +16,7 @@ import pytest
 
 from edge.identity.members import Role
 from lpac.fleet.authority import create_authority, new_member
+from lpac.sim.fleet.keys import give_list
 from tests.needs import needs
 
 pytestmark = needs("ip", root=True)
@@ -205,6 +206,7 @@ def airs(tmp_path: Path) -> Iterator[Callable[[], Air]]:
                     authority, air.keys / f"r{robot_id}", Role.ROBOT, f"r{robot_id}", robot_id
                 )
             new_member(authority, air.keys / "ground", Role.OPERATOR, "alice")
+            give_list(authority, *(air.keys / name for name in ("r1", "r2", "ground")))
             return air
 
         yield make
