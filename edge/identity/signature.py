@@ -1,4 +1,4 @@
-"""Ed25519 (RFC 8032), which every card and every message is signed with.
+"""Ed25519 (RFC 8032), which every message is signed with.
 
 Keys are their bytes: 32 of a secret key's seed, 32 of a public key, 64 of a signature.
 """

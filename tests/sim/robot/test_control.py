@@ -748,7 +748,7 @@ def test_a_revoked_robot_is_kept_away_from_where_it_was_last(flown: Flown) -> No
     for _ in range(900):
         flown.tick()
     assert math.dist(flown.odometry()[:2], (x_m, y_m)) < 0.6
-    # They have new cards, and are silent for so long that they must be down.
+    # They are members again, and are silent for so long that they must be down.
     flown.control.revoked = frozenset()
     for _ in range(60):
         flown.tick()
