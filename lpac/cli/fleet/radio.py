@@ -213,7 +213,7 @@ def _checked(
     *,
     loaded: bool,
 ) -> "Checked":
-    from edge.identity.envelope import OVERHEAD_BYTES
+    from edge.identity.envelope import HEAD_BYTES, OVERHEAD_BYTES
     from lpac.fleet.wifi import in_the_wifi, reading
     from lpac.radio.checked import Checked
 
@@ -225,7 +225,7 @@ def _checked(
             o.robot.name: reading(then[o.robot.name], o.value) for o in after if o.value is not None
         },
         transport=config.radio.transport,
-        overhead_bytes=OVERHEAD_BYTES if config.keys is not None else 0,
+        overhead_bytes=HEAD_BYTES if config.keys is None else OVERHEAD_BYTES,
         flight_bytes=flight_bytes,
         loaded=loaded,
         ground_wired=not in_the_wifi(chosen[0].address),
