@@ -15,7 +15,7 @@ from pathlib import Path
 from edge.core.address import require_host
 from edge.core.schema import ConfigError
 from lpac.fleet.deploy import deploy
-from lpac.fleet.hold import lock, overview
+from lpac.fleet.hold import lock, other_identity, overview
 from lpac.fleet.members import Joined, join
 from lpac.fleet.release import load_common, make_release
 from lpac.fleet.session import (
@@ -29,12 +29,10 @@ from lpac.fleet.session import (
 from lpac.fleet.settings import FleetConfig, RobotHost, is_of_computer, load_fleet
 from lpac.fleet.setup import (
     EnrolStep,
-    former_identity,
     retire,
     set_identity,
     set_up_px4,
     set_vision_hub,
-    wanted_identity,
 )
 from lpac.fleet.writer import add_robot
 
@@ -85,8 +83,7 @@ async def enroll(
     async with connect(config, robot, say) as session:
         found = (await overview(session, config))["identity"]
         await lock(session, config, robot)
-        wanted = wanted_identity(config, robot)
-        former = former_identity(found, wanted)
+        former = other_identity(found, config, robot)
         if former is not None and not rename:
             raise RemoteError(f"it is enrolled as {former}: if it is to be {name}, add --yes")
         was_there = name in config.robots
@@ -98,7 +95,7 @@ async def enroll(
             config = load_fleet(path)
             robot = config.robots[name]
         on_step(EnrolStep.of(path.name, not was_there))
-        on_step(await set_identity(session, wanted, found))
+        on_step(await set_identity(session, config, robot, found))
         on_step(_member_step(config, await join(session, config, robot, operator)))
         on_step(await set_vision_hub(session, robot))
         on_step(await retire(session, robot, config.predecessors, say))

@@ -166,11 +166,22 @@ def wrong_identity(
     """Describe who answers instead of the robot, and what to do; None if the robot does."""
     if identity is None:
         return "it is not enrolled", f"run `lpac fleet enroll {robot.name} {robot.host}` once"
-    wanted = {"fleet": config.fleet, "robot": robot.name, "robot_id": robot.robot_id}
-    if {key: identity.get(key) for key in wanted} == wanted:
+    other = other_identity(identity, config, robot)
+    if other is None:
         return None
-    return (
-        f"at {robot.host} answers {identity.get('robot')} of fleet {identity.get('fleet')} "
-        f"(id {identity.get('robot_id')})",
-        f"mend the host in {config.path.name}, or enroll it",
-    )
+    fix = f"mend the host in {config.path.name}, or enroll it"
+    return f"at {robot.host} answers {other}", fix
+
+
+def other_identity(
+    identity: dict[str, object] | None, config: FleetConfig, robot: RobotHost
+) -> str | None:
+    """Words for an identity that is not the robot's; None if it is, or there is none."""
+    if identity is None or identity == identity_of(config, robot):
+        return None
+    return "{} of fleet {} (id {})".format(*map(identity.get, ("robot", "fleet", "robot_id")))
+
+
+def identity_of(config: FleetConfig, robot: RobotHost) -> dict[str, object]:
+    """Identity of the robot, as it is written on it."""
+    return {"fleet": config.fleet, "robot": robot.name, "robot_id": robot.robot_id}

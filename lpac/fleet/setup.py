@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, Self
 
 from edge.core.schema import ConfigError
 from lpac.fleet.deploy import lpac_inside
+from lpac.fleet.hold import identity_of, other_identity
 from lpac.fleet.probes import VISION_HUB, containers, units, without_comments
 from lpac.fleet.program import hear_heartbeat, require_disarmed, start, stop
 from lpac.fleet.session import RemoteError, Session
@@ -38,25 +39,14 @@ class EnrolStep(NamedTuple):
         return cls(name, "done" if changed else "was so already", tuple(notes))
 
 
-def wanted_identity(config: FleetConfig, robot: RobotHost) -> dict[str, object]:
-    """Identity that the robot is to have, as it is written on it."""
-    return {"fleet": config.fleet, "robot": robot.name, "robot_id": robot.robot_id}
-
-
-def former_identity(found: dict[str, Any] | None, wanted: dict[str, object]) -> str | None:
-    """Former identity of a robot, in words; None if it had no other."""
-    if found in (None, wanted):
-        return None
-    return "{} of fleet {} (id {})".format(*map(found.get, ("robot", "fleet", "robot_id")))
-
-
 async def set_identity(
-    session: Session, wanted: dict[str, object], found: dict[str, Any] | None
+    session: Session, config: FleetConfig, robot: RobotHost, found: dict[str, Any] | None
 ) -> EnrolStep:
     """Write who this robot is; `found` is what is there."""
+    wanted = identity_of(config, robot)
     if found != wanted:
         await session.write("/etc/lpac/robot.json", json.dumps(wanted).encode() + b"\n")
-    former = former_identity(found, wanted)
+    former = other_identity(found, config, robot)
     return EnrolStep.of("robot id", found != wanted, [f"it was {former}"] if former else [])
 
 
