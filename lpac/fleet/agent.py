@@ -114,28 +114,29 @@ def must(*command: str) -> str:
     """Output of a program. Raises Refused unless it returns 0."""
     done = run(list(command), 60.0)
     if done["code"] != 0:
-        lines = done["err"].split("\n")
-        raise Refused("%s: %s" % (" ".join(command), next(filter(None, reversed(lines)), "fails")))
+        raise Refused("%s: %s" % (" ".join(command), " ".join(done["err"].split()) or "fails"))
     return str(done["out"])
 
 
 @call
-def write(path: str, content: str, mode: int) -> Result:
-    """Write a file, its content in base64, and the folder around it if there is none."""
-    os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
-    write_whole(path, base64.b64decode(content), mode)
+def write(files: Dict[str, str], mode: int) -> Result:
+    """Write files, their contents in base64, and folders around them."""
+    for path, content in files.items():
+        os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
+        write_whole(path, base64.b64decode(content), mode)
     return {}
 
 
 def write_whole(path: str, data: bytes, mode: int = 0o644) -> None:
-    """Write a file that, whenever the power goes, is the old one or the new one.
+    """Write a file that is the old one or the new one whenever the power goes.
 
-    Also in a folder of somebody else's, who may have put a link there for root to follow.
+    It is its folder's owner's, who may have put a link there for root to follow.
     """
-    part = path + ".part"
+    part, owner = path + ".part", os.stat(os.path.dirname(path))
     if os.path.lexists(part):
         os.unlink(part)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
@@ -479,9 +480,8 @@ def linked(directory: str) -> Optional[str]:
 
 def _id(directory: str, release: str) -> str:
     """A release's name by its content: the beginning of its manifest's hash."""
-    with contextlib.suppress(OSError):
-        return _sha256(os.path.join(directory, "releases", release, "manifest.json"))[:16]
-    return release
+    path = os.path.join(directory, "releases", release, "manifest.json")
+    return _sha256(path)[:16] if os.path.exists(path) else release
 
 
 def _sha256(path: str) -> str:

@@ -2,8 +2,7 @@
 
 import base64
 import hashlib
-import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -25,8 +24,6 @@ from lpac.fleet.settings import FleetConfig, RobotHost
 # As `edge.drivers.identity_folder` reads it; the program sees it below /var/lib/lpac. The names
 # are as systemd makes them for a DynamicUser=.
 _IDENTITY, _NEXT_KEY = "/var/lib/private/lpac/identity", "next-key.pem"
-# For the program's user, who owns the folder around, or will when it starts first.
-_OWN = "chown -R --no-dereference --reference=.."
 
 
 class Joined(NamedTuple):
@@ -128,7 +125,7 @@ async def bring_members(session: Session, config: FleetConfig) -> str | None:
     changed = {name: data for name, data in files.items() if digests.get(name) != _sha256(data)}
     if not changed:
         return None
-    await session.must("sh", "-c", _written(changed))
+    await _write(session, changed)
     return f"it was given the list of members {number}"
 
 
@@ -143,11 +140,17 @@ async def _write_member(
 ) -> None:
     """Write what belongs to the key, `fresh` or not. The robot's program reads it when it starts.
 
-    In one call, which is carried out though the laptop has gone.
+    The key last: until then the robot is no member by the new one, and a repeat mends it.
     """
     await session.call("require_lock")
     await require_disarmed(session, robot, "a new key")
-    await session.must("sh", "-c", _written(files, f"mv {_NEXT_KEY} {KEY_PEM}" if fresh else ""))
+    await _write(session, files)
+    if fresh:
+        await session.must("mv", f"{_IDENTITY}/{_NEXT_KEY}", f"{_IDENTITY}/{KEY_PEM}")
+
+
+async def _write(session: Session, files: Mapping[str, bytes]) -> None:
+    await session.write({f"{_IDENTITY}/{name}": data for name, data in files.items()}, 0o600)
 
 
 async def _public_key(session: Session, *, fresh: bool) -> bytes:
@@ -160,7 +163,8 @@ async def _public_key(session: Session, *, fresh: bool) -> bytes:
 cd {_IDENTITY}; if [ {int(fresh)} = 1 ] || [ ! -e {key} ]; then
     rm -f part; openssl genpkey -algorithm ed25519 > part; sync part; mv part {key}
 fi
-{_OWN} .; openssl pkey -in {key} -pubout""")  # fmt: skip
+# For the program's user, who owns the folder around, or will when it starts first.
+chown -R --no-dereference --reference=.. .; openssl pkey -in {key} -pubout""")  # fmt: skip
     der = base64.b64decode("".join(pem.strip().splitlines()[1:-1]))
     # An Ed25519 key is the last 32 bytes of its DER (RFC 8410).
     return der[-32:]
@@ -183,16 +187,3 @@ async def _list_number(session: Session) -> int:
         return parse_members(text).number
     except ValueError:
         return 0
-
-
-def _written(files: dict[str, bytes], first: str = "") -> str:
-    """The shell's commands that write files of the identity, each whole or not at all.
-
-    Also where the program's user, whose folder it is, has put a link there for root to follow.
-    """
-    lines = [f"set -eC; umask 077; cd {_IDENTITY}", first]
-    for name, data in files.items():
-        text = base64.b64encode(data).decode()
-        lines.append(f"rm -f part; echo {text} | base64 -d > part; {_OWN} part; sync part")
-        lines.append(f"mv part {shlex.quote(name)}")
-    return "\n".join(lines)

@@ -162,7 +162,9 @@ class Session:
         """Output of a program. Raises RemoteError unless it returns 0; else as `call`."""
         done = await self.run(*command, timeout_s=timeout_s)
         if done.code != 0:
-            raise RemoteError(f"{shlex.join(command)}: {done.reason}")
+            # A script is nothing to read in one line.
+            what = "" if command[0] == "sh" else f"{shlex.join(command)}: "
+            raise RemoteError(what + done.reason)
         return done.out
 
     async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
@@ -178,9 +180,10 @@ class Session:
         shown = await self.run("sh", "-c", script, timeout_s=each_s * len(lines) + 5.0)
         return dict(zip(commands, map(str.strip, shown.out.split(_BETWEEN)), strict=False))
 
-    async def write(self, path: str, content: bytes, mode: int = 0o644) -> None:
-        """Write a file of root's, whole or not at all. Raises as `call`."""
-        await self.call("write", path=path, content=b64encode(content).decode(), mode=mode)
+    async def write(self, files: Mapping[str, bytes], mode: int = 0o644) -> None:
+        """Write files, each whole or not at all; by path. Raises as `call`."""
+        contents = {path: b64encode(data).decode() for path, data in files.items()}
+        await self.call("write", files=contents, mode=mode)
 
     async def close(self) -> None:
         """End the conversation; locks that it held are free then."""

@@ -45,7 +45,7 @@ async def set_identity(
     """Write who this robot is; `found` is what is there."""
     wanted = identity_of(config, robot)
     if found != wanted:
-        await session.write("/etc/lpac/robot.json", json.dumps(wanted).encode() + b"\n")
+        await session.write({"/etc/lpac/robot.json": json.dumps(wanted).encode() + b"\n"})
     former = other_identity(found, config, robot)
     return EnrolStep.of("robot id", found != wanted, [f"it was {former}"] if former else [])
 
@@ -78,7 +78,7 @@ async def set_vision_hub(session: Session, robot: RobotHost) -> EnrolStep:
     await require_disarmed(session, robot, "changing voxl-vision-hub")
     kept = f"{VISION_HUB}.before-lpac"
     await session.must("sh", "-c", f"[ -e {kept} ] || cp -p {VISION_HUB} {kept}")
-    await session.write(VISION_HUB, f"{json.dumps(values | wanted, indent=4)}\n".encode())
+    await session.write({VISION_HUB: f"{json.dumps(values | wanted, indent=4)}\n".encode()})
     if (await _unit(session, _HUB_UNIT))["active"]:
         await session.must("systemctl", "restart", _HUB_UNIT)
     else:

@@ -71,7 +71,7 @@ def test_a_robots_key_is_made_on_it_and_replaced_with_what_belongs_to_it(
     assert second != first and (folder / "key.pem").read_bytes() == key
     # The program's user may have put a link there for root to follow.
     others.write_text("theirs")
-    (folder / "part").symlink_to(others)
+    (folder / "certificate.pem.part").symlink_to(others)
     data = os.urandom(5000)
     files = {"certificate.pem": data, "authority.pem": b""}
     asyncio.run(members._write_member(session, robot, files, fresh=True))

@@ -147,8 +147,8 @@ class Robot(LocalSession):
             self.changed.append(command)
         return Done(0, self.out, "")
 
-    async def write(self, path: str, content: bytes, mode: int = 0o644) -> None:
-        self.changed.append(path)
+    async def write(self, files: Mapping[str, bytes], mode: int = 0o644) -> None:
+        self.changed += files
 
     async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
         running = "Id=old.service\nLoadState=loaded\nActiveState=active\nUnitFileState=enabled\n"
