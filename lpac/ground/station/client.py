@@ -91,13 +91,15 @@ def _connected(fleet: str, line: bytes) -> Iterator[Iterator[ServerMessage]]:
         connection.settimeout(_PATIENCE_S)
         with _ground_errors(fleet):
             connection.connect(str(socket_path(fleet)))
-            connection.sendall(line)
         with connection.makefile("rb") as lines:
-            yield _read(fleet, lines)
+            yield _read(fleet, connection, line, lines)
 
 
-def _read(fleet: str, lines: Iterable[bytes]) -> Iterator[ServerMessage]:
+def _read(
+    fleet: str, connection: socket.socket, line: bytes, lines: Iterable[bytes]
+) -> Iterator[ServerMessage]:
     with _ground_errors(fleet):
+        connection.sendall(line)
         yield from map(server_message_from_line, lines)
     raise _ended(fleet)
 
