@@ -56,8 +56,9 @@ class Harm:
     """What came of a lie in one mission.
 
     `pushed_m` is the most that a robot is from where it is without the lie, `fence_m` the least
-    that one is inside the fence, both in truth; `left_mission` are robots that do not fly it at the
-    end, `down` those that were disarmed or landed at any time.
+    that one is inside the fence, both in truth, `estimated_fence_m` that by its own estimate;
+    `left_mission` are robots that do not fly it at the end, `down` those that were disarmed or
+    landed at any time.
     """
 
     pushed_m: float
@@ -66,6 +67,7 @@ class Harm:
     fence_m: float
     left_mission: int
     down: int
+    estimated_fence_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,6 +225,7 @@ class _Flown:
     position_m: F64
     speed_m_s: F64
     down: int
+    estimated_m: list[tuple[float, float]]
 
 
 def _flown(before: SimulatedFleet, lie: Lie, seed: int, mission_s: float) -> _Flown:
@@ -230,7 +233,10 @@ def _flown(before: SimulatedFleet, lie: Lie, seed: int, mission_s: float) -> _Fl
     Thief(fleet, lie, seed)
     for each in fleet.vehicles:
         each.vehicle.truth.clear()
-    _pass(fleet, mission_s)
+    estimated_m: list[tuple[float, float]] = []
+    for _ in range(round(mission_s / _STEP_S)):
+        _pass(fleet, _STEP_S)
+        estimated_m += [s.position_m[:2] for s in _statuses(fleet) if s and s.position_m]
     truths = [each.vehicle.truth for each in fleet.vehicles]
     return _Flown(
         fleet,
@@ -250,6 +256,7 @@ def _flown(before: SimulatedFleet, lie: Lie, seed: int, mission_s: float) -> _Fl
         ),
         np.array([[np.hypot(*entry.velocity_m_s[:2]) for entry in truth] for truth in truths]),
         sum(any(entry.landed or not entry.armed for entry in truth) for truth in truths),
+        estimated_m,
     )
 
 
@@ -270,4 +277,5 @@ def _harm(flown: _Flown, undisturbed: _Flown) -> Harm:
             for status in _statuses(flown.fleet)
         ),
         down=flown.down,
+        estimated_fence_m=min(fence.distance_m(x, y) for x, y in flown.estimated_m),
     )
