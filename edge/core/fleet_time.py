@@ -6,7 +6,8 @@ delays.
 """
 
 import math
-from typing import NamedTuple
+
+from msgspec import Struct
 
 # Drift of both clocks' crystals, s per s.
 _DRIFT = 1e-4
@@ -16,7 +17,7 @@ _ROUNDED_S = 1e-3
 _MOST_GROUNDS = 4
 
 
-class FleetTime(NamedTuple):
+class FleetTime(Struct, frozen=True):
     """An instant by the clock of the ground `base`, within `uncertainty_s` of `time_s`."""
 
     base: int
@@ -24,14 +25,14 @@ class FleetTime(NamedTuple):
     uncertainty_s: float
 
 
-class Age(NamedTuple):
+class Age(Struct, frozen=True):
     """Bounds of an age, s."""
 
     least_s: float
     most_s: float
 
 
-class _Known(NamedTuple):
+class _Known(Struct, frozen=True):
     """The ground's clock minus the own one, at `at_s` of the own one."""
 
     offset_s: float

@@ -9,11 +9,12 @@ docs/safety.md.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
-from msgspec import Meta
+from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from edge.core.schema import Bounded, Positive
 from edge.core.vehicle import Gps, VehicleState
@@ -130,8 +131,7 @@ class PositionLimits(Bounded):
             )
 
 
-@dataclass(frozen=True, slots=True)
-class PositionJudgement:
+class PositionJudgement(Struct, frozen=True):
     """Trust in the position, since `since_s`; `cause` is the present or last cause of distrust.
 
     `value` is the measured value of a cause with a number. `contradicted_at_s` is when the receiver

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from edge.core import F64
 from edge.core.position import PositionQuality
@@ -107,7 +108,7 @@ def guide(
         return _hold(robot, flight, inputs, guidance, position_m, dt_s)
     if state is FlightState.TAKEOFF:
         # A silent robot may still hover at its last place.
-        silent = (each._replace(velocity_m_s=_NO_SPEED_M_S) for each in inputs.fell_silent)
+        silent = (replace(each, velocity_m_s=_NO_SPEED_M_S) for each in inputs.fell_silent)
         separation_m = robot.parameters.min_separation_m
         clear_m = clear_height_m(position_m, (*inputs.neighbours, *silent), separation_m)
         return _towards(flight.target_m, max(height, clear_m), position_m, limits), Guidance()

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from edge.core import F64
 from edge.core.fence import Fence
@@ -63,7 +64,7 @@ def may_stand(
 
     It comes down at some time, unheard.
     """
-    stopped = silent._replace(age_s=max(silent.age_s, limits.flies_on_s))
+    stopped = replace(silent, age_s=max(silent.age_s, limits.flies_on_s))
     return [
         StandingRobot(silent.robot_id, (x_m, y_m), its_landing_point_m, strays_m(stopped, limits))
         for x_m, y_m in stops_m(stopped, limits).tolist()

@@ -5,8 +5,10 @@ the ground and reports to be in the air. Height, climb rate and thrust reveal it
 """
 
 import math
-from dataclasses import dataclass, replace
 from typing import NamedTuple
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 # No control error lasts this long at this distance from its height, where others fly.
 OFF_HEIGHT_M, _OFF_S = 1.5, 2.0
@@ -37,8 +39,7 @@ class Motion(NamedTuple):
     ground_below_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class Lift:
+class Lift(Struct, frozen=True):
     """State kept from tick to tick.
 
     `slack_m` is the permitted distance from the height on the way to it. The vehicle has exceeded

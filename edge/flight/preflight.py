@@ -329,13 +329,14 @@ def _place(inputs: PreflightInputs) -> Iterator[FailedCheck]:
 
 
 def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
-    others = [heard for heard in inputs.neighbours if heard.beacon.robot_id != inputs.robot_id]
-    if inputs.duplicate_id or len(others) < len(inputs.neighbours):
+    heard = [each.beacon for each in inputs.neighbours]
+    others = [beacon for beacon in heard if beacon.robot_id != inputs.robot_id]
+    if inputs.duplicate_id or len(others) < len(heard):
         yield FailedCheck(
             CheckCode.DUPLICATE_ID,
             f"another program says that it is robot {inputs.robot_id}: stop it, or change its id",
         )
-    releases = [(f"robot {beacon.robot_id}", beacon.other_release) for beacon, *_ in others]
+    releases = [(f"robot {beacon.robot_id}", beacon.other_release) for beacon in others]
     unreadable = [(name, "not readable") for name in inputs.strangers]
     for who, release in (*releases, ("the ground", inputs.ground_release), *unreadable):
         if release:
@@ -351,7 +352,7 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
         )
     bundle_tag, world_tag = tag(inputs.bundle_id), tag(inputs.world_id)
     frame_id = None if inputs.origin is None else inputs.origin.frame().frame_id
-    for beacon, *_ in others:
+    for beacon in others:
         other = f"robot {beacon.robot_id}"
         if beacon.system_id is not None and beacon.system_id == inputs.system_id:
             yield FailedCheck(
@@ -373,10 +374,10 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
                 f"{other} has another mission origin: set it again on the ground",
             )
         yield from _apart(inputs, beacon, other)
-    yield from _in_the_way(inputs, [heard.beacon for heard in others])
+    yield from _in_the_way(inputs, others)
     if not inputs.vehicle.armed:
         yield from _may_come_down(inputs)
-        yield from _too_late(inputs.errors, [heard.beacon for heard in others])
+        yield from _too_late(inputs.errors, others)
 
 
 def _may_come_down(inputs: PreflightInputs) -> Iterator[FailedCheck]:

@@ -5,8 +5,10 @@ can be read from the middle. A tick's memory is usually the result of the last o
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from edge.core.changes import changed, changes
 from edge.core.vehicle import Action, Vector
@@ -23,8 +25,7 @@ class TickError(ValueError):
     """A message is not a valid tick; the text says why."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Given:
+class Given(Struct, frozen=True, eq=False):
     """All inputs of `step` and `guide` in one tick."""
 
     robot: Robot
@@ -34,8 +35,7 @@ class Given:
     dt_s: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Made:
+class Made(Struct, frozen=True, eq=False):
     """Result of a tick. One of the two setpoints is set, in the mission frame, or none."""
 
     flight: FlightMemory
@@ -60,8 +60,7 @@ def made(decision: Decision, setpoint: MissionSetpoint | None, guidance: Guidanc
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FlightTick:
+class FlightTick(Struct, frozen=True, eq=False):
     """One control tick."""
 
     given: Given

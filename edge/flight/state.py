@@ -151,8 +151,7 @@ class FlightMemory(Struct, frozen=True):
     lift: Lift = Lift()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FlightInputs:
+class FlightInputs(Struct, frozen=True, eq=False):
     """Inputs of one control tick.
 
     `position` is the judged quality. `odometry` is in the mission frame, with z the altitude above
@@ -291,8 +290,7 @@ class Robot:
             raise ValueError(f"the ground's fence or place does not fit: {error}") from None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Tick:
+class Tick(Struct, frozen=True, eq=False):
     """Memory and inputs together, with derived values."""
 
     robot: Robot

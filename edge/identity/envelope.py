@@ -23,6 +23,8 @@ import struct
 from importlib.metadata import version
 from typing import NamedTuple
 
+from msgspec import Struct
+
 from edge.identity.news import MessageNumber
 from edge.identity.signature import FINGERPRINT_BYTES, SIGNATURE_BYTES, Signer, is_signed
 
@@ -53,7 +55,7 @@ class Address(NamedTuple):
         return b"".join((b"lpac envelope 2\0", self.authority, self.key.encode(), b"\0", sealed))
 
 
-class Head(NamedTuple):
+class Head(Struct, frozen=True):
     """The fields before a message's payload."""
 
     release: bytes
@@ -67,7 +69,7 @@ class Head(NamedTuple):
         return self.fingerprint != _NO_KEY
 
 
-class Envelope(NamedTuple):
+class Envelope(Struct, frozen=True):
     """A message as it came; whether its sender said so is for `is_from` to tell."""
 
     head: Head

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from threading import Lock
-from typing import NamedTuple
+
+from msgspec import Struct
 
 from edge.core.logger import log
 from edge.identity.envelope import (
@@ -37,7 +38,7 @@ _MOST_NAMED = 4
 _MOST_AHEAD_MS = 24 * 3600e3
 
 
-class Speaker(NamedTuple):
+class Speaker(Struct, frozen=True):
     """Sender of a message, and its program: `name` is the list's, "" where nothing is signed.
 
     `number` is the message's; `release` and `members` are what the sender flies and knows.

@@ -34,6 +34,8 @@ import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from msgspec import Struct, structs
+
 from edge.core.fleet_time import FleetTime
 from edge.core.vehicle import Vector
 from edge.messages.codec import MessageError
@@ -80,7 +82,7 @@ _FIELDS = {
 }
 _STRUCT = struct.Struct("<" + "".join(number.code for number in _FIELDS.values()))
 BEACON_BYTES = _STRUCT.size
-_NO_TIME = FleetTime(0, 0.0, 0.0)
+_NO_TIME = 0, 0.0, 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +111,7 @@ class Beacon:
     other_release: str = ""
 
 
-class HeardBeacon(NamedTuple):
+class HeardBeacon(Struct, frozen=True):
     """Another robot's; when it came, and since when it may be on its way: monotonic clock, s."""
 
     beacon: Beacon
@@ -117,7 +119,7 @@ class HeardBeacon(NamedTuple):
     sent_at_s: float
 
 
-class Neighbour(NamedTuple):
+class Neighbour(Struct, frozen=True, array_like=True):
     """Another robot: its position and velocity in the mission frame, as they were `age_s` ago.
 
     `is_piloted`: somebody else than its program flies it, or it does not hold its height, so that
@@ -157,7 +159,7 @@ def encode_beacon(beacon: Beacon) -> bytes:
         beacon.frame_id,
         beacon.bundle_tag,
         beacon.world_tag,
-        *(beacon.sent or _NO_TIME),
+        *(structs.astuple(beacon.sent) if beacon.sent else _NO_TIME),
     )
     return _STRUCT.pack(*map(_packed, _FIELDS.values(), values))
 

@@ -369,12 +369,12 @@ class FlightControl:
                 beacon.robot_id,
                 beacon.position_m,
                 beacon.velocity_m_s,
-                max(now_s - sent_at_s, 0.0),
+                max(now_s - heard.sent_at_s, 0.0),
                 beacon.state is FlightState.PILOT or _is_off_height(beacon),
             )
-            for beacon, heard_at_s, sent_at_s in peers
-            if now_s - heard_at_s <= _KEEPS_AWAY_S
-            and beacon.frame_id == self._pac.frame_id
+            for heard in peers
+            if now_s - heard.heard_at_s <= _KEEPS_AWAY_S
+            and (beacon := heard.beacon).frame_id == self._pac.frame_id
             and beacon.position_m is not None
             and beacon.velocity_m_s is not None
         )
@@ -417,7 +417,7 @@ class FlightControl:
                 self._last_words[beacon.robot_id] = heard_beacon
         others = {self.assignment.robot.robot_id, *(n.robot_id for n in heard), *self.revoked}
         return tuple(
-            told._replace(age_s=now_s - self._last_words[robot_id].heard_at_s)
+            replace(told, age_s=now_s - self._last_words[robot_id].heard_at_s)
             for robot_id in sorted(self._last_words.keys() - others)
             if (told := last_word(self._last_words[robot_id].beacon, silence)) is not None
         )
@@ -426,7 +426,8 @@ class FlightControl:
         self, peers: tuple[HeardBeacon, ...], silent: tuple[Neighbour, ...]
     ) -> Point | None:
         frame_id, robot = self._pac.frame_id, self.assignment.robot
-        for beacon, *_ in peers:
+        for peer in peers:
+            beacon = peer.beacon
             if beacon.frame_id == frame_id and beacon.robot_id != robot.robot_id:
                 self._last_beacons[beacon.robot_id] = beacon
         others, parameters = self._last_beacons, robot.parameters

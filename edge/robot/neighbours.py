@@ -76,6 +76,7 @@ class NeighbourTable:
         self._restart_silence_s = max(max_message_age_s, _LONGEST_TRANSIT_S)
         self._lock = Lock()
         # Outlive the messages: a late duplicate must not pass for news.
+        # In the order of robot ids.
         self._robots: dict[int, _Robot] = {}
         self._counts: Counter[str] = Counter(
             dict.fromkeys(["accepted", *(reason.value for reason in Rejection)], 0)
@@ -116,7 +117,8 @@ class NeighbourTable:
         heard = HeardBeacon(beacon, now_s, now_s - known_s)
         robot = self._robots.get(beacon.robot_id)
         if robot is None:
-            robot = self._robots[beacon.robot_id] = _Robot(number, heard)
+            robot = _Robot(number, heard)
+            self._robots = dict(sorted([*self._robots.items(), (beacon.robot_id, robot)]))
         elif number > robot.number or (
             number[0] != robot.number[0]
             and now_s - robot.heard.heard_at_s > self._restart_silence_s
@@ -142,7 +144,7 @@ class NeighbourTable:
     def swap(self, now_s: float) -> tuple[ReceivedMessage, ...]:
         """The messages for one policy tick, by robot id: their order of arrival is no matter."""
         with self._lock:
-            received = [robot.received for _, robot in sorted(self._robots.items())]
+            received = [robot.received for robot in self._robots.values()]
             if self._max_message_age_s == 0.0:
                 for robot in self._robots.values():
                     robot.handed_out, robot.received = robot.received, None
@@ -151,7 +153,7 @@ class NeighbourTable:
     def neighbours(self, now_s: float) -> tuple[ReceivedMessage, ...]:
         """Robots whose policies are heard, by robot id; takes nothing away."""
         with self._lock:
-            received = [r.received or r.handed_out for _, r in sorted(self._robots.items())]
+            received = [r.received or r.handed_out for r in self._robots.values()]
         return self._fresh(received, now_s)
 
     def _fresh(
@@ -165,7 +167,7 @@ class NeighbourTable:
     def heard(self, now_s: float, max_age_s: float) -> tuple[HeardBeacon, ...]:
         """Beacons that came in the last `max_age_s`, of any mission frame, by robot id."""
         with self._lock:
-            heard = [robot.heard for _, robot in sorted(self._robots.items())]
+            heard = [robot.heard for robot in self._robots.values()]
         return tuple(each for each in heard if now_s - each.heard_at_s <= max_age_s)
 
     def last_heard_s(self, robot_id: int) -> float:

@@ -10,7 +10,9 @@ is late, the vehicle's own time does, of those messages that have it.
 import math
 from collections import deque
 from collections.abc import Hashable
-from typing import Literal, NamedTuple
+from typing import Literal
+
+from msgspec import Struct
 
 _NUMBERS = 256
 _MOST_PATHS = 8
@@ -33,7 +35,7 @@ _LEAST_TWICE, _LEAST_OTHERS, _OTHERS_SHARE = 20, 3, 0.25
 _Sort = Literal["next", "again", "late", "other"]
 
 
-class Frame(NamedTuple):
+class Frame(Struct, frozen=True):
     """One frame: `path` is what it came by, `number` MAVLink's sequence, `content` all of it.
 
     `vehicle_s` is the vehicle's time when it was sent; None where the message has none.
@@ -46,7 +48,7 @@ class Frame(NamedTuple):
     vehicle_s: float | None = None
 
 
-class _Newest(NamedTuple):
+class _Newest(Struct, frozen=True):
     """Newest frame of a message: the vehicle's time, when it came, and by which path."""
 
     vehicle_s: float
@@ -65,7 +67,7 @@ class _Stream:
         self.heard_at_s = -math.inf
 
 
-class _Taken(NamedTuple):
+class _Taken(Struct, frozen=True):
     """A frame that was taken: when, by which path, and of which stream."""
 
     at_s: float

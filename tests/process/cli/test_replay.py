@@ -99,7 +99,7 @@ def test_a_decision_that_differs_is_shown_and_fails(tmp_path: Path, shipped_bund
         assert tick is not None
         if len(messages) == 40:  # As if it had landed there.
             landing = structs.replace(tick.made.flight, state=FlightState.LAND)
-            tick = FlightTick(tick.given, dataclasses.replace(tick.made, flight=landing))
+            tick = FlightTick(tick.given, structs.replace(tick.made, flight=landing))
         messages.append((topic, unix_time_s, writer.message(tick)))
     log = write_log(tmp_path, shipped_bundle, messages)
     result = called("replay", log)

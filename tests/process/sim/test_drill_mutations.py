@@ -6,6 +6,7 @@ from functools import cache, partial
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 import edge.flight.guidance
 import edge.flight.orders
@@ -100,7 +101,9 @@ def landing_points_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
         others = {0: 1, 1: 0}
         points_m = _landing_points_m()
         return homewards(
-            robot, replace(inputs, lands_beside_m=points_m[others[robot.robot_id]]), position_m
+            robot,
+            structs.replace(inputs, lands_beside_m=points_m[others[robot.robot_id]]),
+            position_m,
         )
 
     monkeypatch.setattr(edge.flight.guidance, "_homewards", to_another)

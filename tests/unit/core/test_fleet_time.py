@@ -89,9 +89,10 @@ def test_the_newest_ground_counts_and_the_one_before_is_understood() -> None:
     exchange.say(0.0, 0.01, 0.0, 0.01)
     exchange.clock.hear(OTHER, 500.0, echoed_at_s=1.0, held_s=0.0, now_s=1.0)
     newest = exchange.clock.at(1.0)
-    assert newest is not None and newest[:2] == (OTHER, 500.0)
+    assert newest is not None and (newest.base, newest.time_s) == (OTHER, 500.0)
     age = exchange.clock.age_s(FleetTime(GROUND, 1.0, 0.0), 2.0)
-    assert age == pytest.approx((0.989, 1.011), abs=1e-3)
+    assert age is not None
+    assert (age.least_s, age.most_s) == pytest.approx((0.989, 1.011), abs=1e-3)
     for base in range(100, 110):
         exchange.clock.hear(base, 0.0, echoed_at_s=1.0, held_s=0.0, now_s=1.0)
     assert exchange.clock.age_s(FleetTime(GROUND, 1.0, 0.0), 2.0) is None

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from edge.drivers.px4.reception import Frame, VehicleFrames
 
@@ -51,7 +52,7 @@ def heard(frames: VehicleFrames, arrivals: Iterable[Arrival]) -> list[Arrival]:
 
 def later(arrivals: Iterable[Arrival], by_s: float, path: str | None = None) -> Iterator[Arrival]:
     for a in arrivals:
-        frame = a.frame if path is None else a.frame._replace(path=path)
+        frame = a.frame if path is None else structs.replace(a.frame, path=path)
         yield a._replace(at_s=a.at_s + by_s, frame=frame)
 
 

@@ -2247,7 +2247,7 @@ def test_a_row_does_what_its_fields_say() -> None:
     assert (after.reached, after.target_m) == (False, (1.0, 2.0, 3.0))
     assert after.alone_since_s == after.rejoined_at_s == world.now_s
     vehicle = structs.replace(world.heard, mode=Mode.HOLD)
-    in_hold = replace(t, inputs=replace(t.inputs, vehicle=vehicle))
+    in_hold = structs.replace(t, inputs=structs.replace(t.inputs, vehicle=vehicle))
     sometimes = replace(row, left_alone="if in hold")
     assert enter(sometimes, "so", t).alone_since_s is None
     assert enter(sometimes, "so", in_hold).alone_since_s == world.now_s

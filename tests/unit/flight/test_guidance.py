@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,7 +108,7 @@ class Vehicle:
             x, y, z = self.position_m.tolist()
             vx, vy, vz = self.velocity_m_s.tolist()
             given = inputs((x, y, z), (vx, vy, vz), policy_m_s, neighbours)
-            given = replace(given, ground_age_s=ground_age_s)
+            given = structs.replace(given, ground_age_s=ground_age_s)
             sent, memory = guide(ROBOT, state, given, memory, TICK_S)
             assert sent is not None
             self.follow(sent)
@@ -196,7 +195,7 @@ def hold_over_each_other(
         told = told_before[max(tick - late, 0)] if tick * TICK_S < hear_until_s else []
         for i, vehicle in enumerate(fleet):
             place_m, velocity_m_s = vehicle.position_m + errors_m[i], vehicle.velocity_m_s
-            given = replace(
+            given = structs.replace(
                 inputs(_vector(place_m), _vector(velocity_m_s)),
                 neighbours=tuple(each for each in told if each.robot_id != i),
                 ground_age_s=ground_age_s(tick * TICK_S),
@@ -305,7 +304,9 @@ def test_nobody_pushes_who_holds_further_than_that(is_piloted: bool) -> None:
         beside_m = _vector(vehicle.position_m - (0.5, 0.0, 0.0))
         liar = Neighbour(2, beside_m, STILL, 0.0, is_piloted=is_piloted)
         given = inputs(_vector(vehicle.position_m), _vector(vehicle.velocity_m_s))
-        sent, memory = guide(ROBOT, hold, replace(given, neighbours=(liar,)), memory, TICK_S)
+        sent, memory = guide(
+            ROBOT, hold, structs.replace(given, neighbours=(liar,)), memory, TICK_S
+        )
         assert sent is not None
         vehicle.follow(sent)
     assert math.dist(vehicle.position_m, AT_SLOT) < ROBOT.separation.landed_m + 0.1
@@ -325,7 +326,7 @@ def test_nobody_leaves_its_place_while_the_ground_is_heard_or_by_what_is_no_meas
     broken = Neighbour(4, (math.nan, 17.0, SLOT_M), STILL, 0.2)
     hold = flight(FlightState.HOLD, AT_SLOT)
     held = position(hold, inputs(neighbours=(above,)))
-    lost = replace(inputs(neighbours=(broken,)), ground_age_s=5.0)
+    lost = structs.replace(inputs(neighbours=(broken,)), ground_age_s=5.0)
     np.testing.assert_allclose([held, position(hold, lost)], [AT_SLOT] * 2)
 
 

@@ -414,7 +414,9 @@ def test_nobody_follows_those_who_took_off_long_ago() -> None:
     assert line.startswith("robot 3 has been in the air since before its program started: heights")
     for patient in (ErrorBudget(takeoffs_height_m=1.0), ErrorBudget(height_common_m=0.0)):
         wide = tuple(
-            heard._replace(beacon=dataclasses.replace(heard.beacon, slot_height_m=20.0 + 5.0 * i))
+            structs.replace(
+                heard, beacon=dataclasses.replace(heard.beacon, slot_height_m=20.0 + 5.0 * i)
+            )
             for i, heard in enumerate(in_the_air(63.0, 63.0))
         )
         assert said(errors=patient, neighbours=wide) == []
@@ -452,8 +454,8 @@ def test_nobody_takes_off_where_somebody_may_come_down_who_fell_silent() -> None
     ("silent", "armed"),
     [
         # It stops too far away; it must be down; the robot flies itself.
-        (SILENT._replace(velocity_m_s=(2.0, 0.0, 0.0)), False),
-        (SILENT._replace(age_s=66.0 + 9.5 / 0.5), False),
+        (structs.replace(SILENT, velocity_m_s=(2.0, 0.0, 0.0)), False),
+        (structs.replace(SILENT, age_s=66.0 + 9.5 / 0.5), False),
         (SILENT, True),
     ],
 )

@@ -230,7 +230,7 @@ def test_what_is_no_tick_is_one_line() -> None:
     first = next(m for _, _, m in read(RECORDED / "normal.mcap", "flight"))
     for message, why in (
         ({}, "'number' is missing"),
-        ({**first, "given": {}}, "missing 5 required"),
+        ({**first, "given": {}}, "Missing required argument"),
         ({**first, "given": {**first["given"], "dt_s": "soon"}}, "Expected `float`"),
         ({**first, "given": {**first["given"], "luck": 1}}, "Given has no luck"),
         ({**first, "made": 7}, "items"),
@@ -242,7 +242,7 @@ def test_what_is_no_tick_is_one_line() -> None:
 def test_what_changed_is_told_alone_and_exactly() -> None:
     first = ticks("normal")[0].given.inputs
     vehicle = structs.replace(first.vehicle, height_jumped_m=-0.0, battery=math.nan)
-    second = replace(first, vehicle=vehicle, order=None, uptime_s=first.uptime_s)
+    second = structs.replace(first, vehicle=vehicle, order=None, uptime_s=first.uptime_s)
     told = changes(first, second)
     assert told.keys() == {"vehicle"} and told["vehicle"].keys() == {"height_jumped_m", "battery"}
     again = changed(type(first), first, told)

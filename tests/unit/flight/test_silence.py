@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from edge.core.fence import Fence
 from edge.flight.landing import may_stand, place_to_land, standing_robots
@@ -61,7 +62,9 @@ def test_nobody_is_believed_to_be_higher_or_faster_than_it_can_be() -> None:
 def test_it_is_down_when_it_must_have_come_down() -> None:
     said = last_word(FLYING, LIMITS)
     assert said is not None
-    heights_m = [highest_still_m(said._replace(age_s=t), LIMITS) for t in (2.0, 66.0, 76.0, 84.1)]
+    heights_m = [
+        highest_still_m(structs.replace(said, age_s=t), LIMITS) for t in (2.0, 66.0, 76.0, 84.1)
+    ]
     assert heights_m == pytest.approx([9.0, 9.0, 4.0, -0.05])
 
 
@@ -69,10 +72,10 @@ def test_it_is_down_when_it_must_have_come_down() -> None:
 def test_it_may_have_stopped_anywhere_on_its_way(x_m: float, y_m: float, age_s: float) -> None:
     said = last_word(FLYING, LIMITS)
     assert said is not None
-    apart_m = np.hypot(*np.diff(stops_m(said._replace(age_s=age_s), LIMITS), axis=0).T)
+    apart_m = np.hypot(*np.diff(stops_m(structs.replace(said, age_s=age_s), LIMITS), axis=0).T)
     assert (apart_m <= 2.0 + 1e-9).all()
     place_m = np.array([x_m, y_m])
-    near_m = nearest_on_way_m(said._replace(age_s=age_s), LIMITS, place_m)
+    near_m = nearest_on_way_m(structs.replace(said, age_s=age_s), LIMITS, place_m)
     way_m = np.array([3.0, 4.0]) + np.outer(
         np.linspace(0.0, min(age_s, LIMITS.flies_on_s), 101), [1.0, 0.0]
     )
@@ -87,12 +90,12 @@ def test_in_the_end_it_stands_on_its_way(speed_m_s: float, x_m: float, y_m: floa
     said = last_word(replace(FLYING, velocity_m_s=(speed_m_s, 0.0, 0.0)), limits)
     assert said is not None
     # Where it leads is taken from the first moment on, so that a place that is chosen stays.
-    stands = may_stand(said._replace(age_s=0.1), (3.0, 3.0), limits)
+    stands = may_stand(structs.replace(said, age_s=0.1), (3.0, 3.0), limits)
     ends_m = [stands[0].place_m, stands[-1].place_m]
     assert ends_m[0] == (3.0, 4.0)
     assert ends_m[1] == pytest.approx((3.0 + speed_m_s * limits.flies_on_s, 4.0))
     # Who is 8 m from all of them is nearly as far from the line, which the brake keeps it from.
-    near_m = nearest_on_way_m(said._replace(age_s=90.0), limits, np.array([x_m, y_m]))
+    near_m = nearest_on_way_m(structs.replace(said, age_s=90.0), limits, np.array([x_m, y_m]))
     to_line_m = float(np.hypot(*(near_m - (x_m, y_m))))
     to_places_m = min(np.hypot(*(np.array(each.place_m) - (x_m, y_m))) for each in stands)
     assert to_line_m**2 >= to_places_m**2 - 1.0 - 1e-6
@@ -101,9 +104,9 @@ def test_in_the_end_it_stands_on_its_way(speed_m_s: float, x_m: float, y_m: floa
 def test_who_flew_may_have_turned_and_who_hovered_may_not() -> None:
     said = last_word(FLYING, LIMITS)
     assert said is not None
-    strayed_m = [strays_m(said._replace(age_s=age_s), LIMITS) for age_s in (0.0, 1.0, 90.0)]
+    strayed_m = [strays_m(structs.replace(said, age_s=age_s), LIMITS) for age_s in (0.0, 1.0, 90.0)]
     assert strayed_m == pytest.approx([0.0, 0.5, 0.5 * LIMITS.flies_on_s])
-    hovers = said._replace(velocity_m_s=(0.0, 0.0, 0.0), age_s=90.0)
+    hovers = structs.replace(said, velocity_m_s=(0.0, 0.0, 0.0), age_s=90.0)
     assert strays_m(hovers, LIMITS) == 0.0
     (stands,) = may_stand(hovers, (16.0, 8.0), LIMITS)
     assert stands.away_m((3.0, 14.0)) == 10.0

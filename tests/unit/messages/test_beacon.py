@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetTime
@@ -126,5 +127,6 @@ def test_any_bytes_are_within_bounds_or_refused(data: bytes) -> None:
     except MessageError as error:
         assert str(error).startswith("Beacon: ")
         return
-    numbers = (*(beacon.position_m or ()), *(beacon.velocity_m_s or ()), *(beacon.sent or ()))
+    sent = () if beacon.sent is None else structs.astuple(beacon.sent)
+    numbers = (*(beacon.position_m or ()), *(beacon.velocity_m_s or ()), *sent)
     assert all(map(math.isfinite, numbers))

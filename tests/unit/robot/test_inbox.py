@@ -7,6 +7,7 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from edge.identity.guard import Speaker
 from edge.identity.members import Role
@@ -170,7 +171,7 @@ def test_of_another_release_an_order_is_taken_as_far_as_it_is_understood() -> No
 
 
 def test_the_grounds_release_is_that_of_the_state_that_counts() -> None:
-    inbox, other = make_inbox(), ANYBODY._replace(release=b"abcd")
+    inbox, other = make_inbox(), structs.replace(ANYBODY, release=b"abcd")
     for now_s, data, speaker, release in (
         (1.0, encode(STATE), other, "61626364"),
         (1.5, encode(dataclasses.replace(STATE, sequence=4)), ANYBODY, "61626364"),

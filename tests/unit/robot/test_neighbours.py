@@ -361,7 +361,9 @@ class AgainstHistory(RuleBasedStateMachine):
 
     @invariant()
     def beacons_are_the_newest(self) -> None:
-        assert [heard[:2] for heard in self.table.heard(self.now_s, 3.0)] == [
+        assert [
+            (heard.beacon, heard.heard_at_s) for heard in self.table.heard(self.now_s, 3.0)
+        ] == [
             (sent.beacon, at_s)
             for _, (sent, at_s) in sorted(self.heard.items())
             if self.now_s - at_s <= 3.0
@@ -410,8 +412,8 @@ def test_eight_link_threads_lose_nothing_and_turn_nothing_back(max_message_age_s
             seen.append(
                 [
                     (beacon.robot_id, beacon.position_m[1])
-                    for beacon, *_ in table.heard(0.1, 1.0)
-                    if beacon.position_m
+                    for heard in table.heard(0.1, 1.0)
+                    if (beacon := heard.beacon).position_m
                 ]
             )
         swapped.append(sequences(table.swap(0.1)))
