@@ -18,7 +18,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from edge.core.logger import log
@@ -54,6 +54,7 @@ class Identity:
     start_is_kept: bool = True
     _given_keys: tuple[bytes, ...] = ()
     _stamps: tuple[object, ...] = ()
+    _problems: set[str] = field(default_factory=set)
 
     def guard(self, clock_s: Callable[[], float]) -> SignedGuard:
         """The guard that the program speaks and hears through; `clock_s` is its monotonic clock."""
@@ -70,15 +71,25 @@ class Identity:
         stamps = tuple(_stamp(self.folder / name) for name in (MEMBERS, GROUP_KEYS))
         if stamps != self._stamps:
             self._stamps = stamps
-            try:
-                guard.take(read_members(self.folder))
-                self._given_keys = read_group_keys(self.folder / GROUP_KEYS)
-            except (ValueError, OSError) as error:
-                log.warning("list of members not taken up", why=str(error))
+            self._take(lambda: guard.take(read_members(self.folder)))
+            self._take(self._take_keys)
         if self.group_keys is not None and self._given_keys:
             self.group_keys = _followed(self.group_keys, self._given_keys, in_flight=in_flight)
         if not self.start_is_kept:
             _keep_start(self)
+
+    def _take_keys(self) -> None:
+        self._given_keys = read_group_keys(self.folder / GROUP_KEYS)
+
+    def _take(self, take: Callable[[], None]) -> None:
+        try:
+            take()
+        except (ValueError, OSError) as error:
+            if isinstance(error, OSError):
+                self._stamps = ()  # The next attempt may succeed.
+            if str(error) not in self._problems:
+                self._problems.add(str(error))
+                log.warning("list of members not taken up", why=str(error))
 
 
 def _followed(now: GroupKeys, given: tuple[bytes, ...], *, in_flight: bool) -> GroupKeys:

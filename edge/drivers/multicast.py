@@ -26,6 +26,7 @@ from edge.identity.group import (
     datagrams,
     open_datagram,
 )
+from edge.identity.news import NOTHING
 from edge.messages.admission import Admission
 from edge.messages.topics import MESSAGE, Group, GroupKeys, ReceiveCallback, Topic
 
@@ -52,8 +53,6 @@ class MulticastLink:
 
     Every method may be called from any thread. Close it, or use it as a context manager.
     """
-
-    sends_again = False
 
     def __init__(
         self,
@@ -178,7 +177,9 @@ class MulticastLink:
             self._assembly = Assembly(math.inf if self._group.is_secret else _FORGETS_AFTER_S)
 
     def _take(self, fragment: Fragment, now_s: float) -> None:
-        message = self._assembly.add(fragment, now_s, time.time())
+        # Of an envelope of another version only the sender is known.
+        is_known = fragment.number != NOTHING
+        message = self._assembly.add(fragment, now_s, time.time()) if is_known else fragment.head
         if message is None or self._on_message is None:
             return
         key = f"robot/{fragment.sender}/{MESSAGE.name}"

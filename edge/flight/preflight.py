@@ -329,9 +329,8 @@ def _place(inputs: PreflightInputs) -> Iterator[FailedCheck]:
 
 
 def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
-    heard = [each.beacon for each in inputs.neighbours]
-    others = [beacon for beacon in heard if beacon.robot_id != inputs.robot_id]
-    if inputs.duplicate_id or len(others) < len(heard):
+    others = [each.beacon for each in inputs.neighbours]
+    if inputs.duplicate_id:
         yield FailedCheck(
             CheckCode.DUPLICATE_ID,
             f"another program says that it is robot {inputs.robot_id}: stop it, or change its id",

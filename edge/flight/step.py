@@ -38,7 +38,7 @@ _CLIMBS_SHARE = 0.5
 
 
 class Decision(NamedTuple):
-    """A tick's outcome; `new_trial`: the explored map and the mailbox must be cleared.
+    """A tick's outcome; `new_trial`: the explored map and the neighbours' messages must be cleared.
 
     `taken` is the applied row of `TRANSITIONS`, None if the state stays.
     """

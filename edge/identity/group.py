@@ -42,8 +42,8 @@ from nacl.bindings import (
 )
 from nacl.exceptions import CryptoError
 
-from edge.identity.envelope import HEAD_BYTES, read_head
-from edge.identity.news import MessageNumber, Newest
+from edge.identity.envelope import HEAD_BYTES, is_of_other_version, read_head
+from edge.identity.news import NOTHING, MessageNumber, Newest
 
 KEY_BYTES: int = crypto_secretbox_KEYBYTES
 MOST_FRAGMENTS = 3
@@ -132,10 +132,11 @@ def open_datagram(data: bytes, keys: Sequence[GroupKey]) -> Fragment | None:
         return None
     sender, place, of, envelope_head = _FRAGMENT.unpack_from(opened)
     head = read_head(envelope_head)
-    if not place < of <= MOST_FRAGMENTS or head is None:
+    if not place < of <= MOST_FRAGMENTS or not (head or is_of_other_version(envelope_head)):
         return None
     part = opened[_FRAGMENT.size :]
-    return Fragment(which, sender, place, of, envelope_head, head.number, part)
+    number = head.number if head else NOTHING
+    return Fragment(which, sender, place, of, envelope_head, number, part)
 
 
 # Pieces that say otherwise of their message are of another one: its number and the head that it is

@@ -29,7 +29,7 @@ from edge.identity.envelope import (
 from edge.identity.members import Member, Members, Role, number_of
 from edge.identity.news import NOTHING, MessageNumber, Newest
 from edge.identity.signature import Signer
-from edge.messages.topics import HOLD, Link, ReceiveCallback, Topic
+from edge.messages.topics import HOLD, Link, ReceiveCallback, Topic, robot_id_in
 
 # What was on its way when a member's program started again has come by then.
 _LONGEST_TRANSIT_S = 5.0
@@ -167,7 +167,8 @@ class Guard(ABC):
 
     def take_strangers(self) -> set[int]:
         """Robots that sent envelopes of another version since this was called last."""
-        robots, self._strangers = self._strangers, set()
+        with self._lock:
+            robots, self._strangers = self._strangers, set()
         return robots
 
     def refused(self) -> dict[str, int]:
@@ -182,13 +183,17 @@ class Guard(ABC):
         """Payload and sender of a message that came on that key."""
 
     def _receive(self, topic: Topic, hear: Hear, key: str, data: bytes) -> bool:
+        if topic.sender == "robot" and robot_id_in(key) is None:
+            self._refuse(RefusedMessage.NOT_ALLOWED, key)
+            return False
         envelope = read_envelope(data)
-        if envelope is None and is_of_other_version(data) and key.startswith("robot/"):
-            # Nobody knows whether it is they.
-            self._strangers.add(int(key.split("/")[1]))
-        found = (
-            RefusedMessage.NO_ENVELOPE if envelope is None else self._opened(topic, key, envelope)
-        )
+        found: tuple[bytes, Speaker] | RefusedMessage = RefusedMessage.NO_ENVELOPE
+        if envelope is not None:
+            found = self._opened(topic, key, envelope)
+        elif (robot_id := robot_id_in(key)) is not None and is_of_other_version(data):
+            # Nobody knows whether that robot sent it.
+            with self._lock:
+                self._strangers.add(robot_id)
         if isinstance(found, RefusedMessage):
             self._refuse(found, key)
             return False

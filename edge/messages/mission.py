@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
@@ -90,6 +90,7 @@ STEERED = (FlightState.TAKEOFF, FlightState.HOLD, FlightState.MISSION, FlightSta
 AIRBORNE = (*STEERED, FlightState.LAND)
 
 SafetyAction = Literal["none", "hold", "return", "land"]
+_SAFETY_ACTIONS: dict[str, SafetyAction] = {action: action for action in get_args(SafetyAction)}
 OrderKind = Literal["takeoff", "start", "pilot", "rejoin", "reset", "disarm", "kill"]
 
 
@@ -128,18 +129,22 @@ class Echo:
 
 @dataclass(frozen=True, slots=True)
 class SafetyRequest:
-    """The part of a `GroundState` by which robots hold and land, even if they refuse the rest."""
+    """The part of a `GroundState` by which robots hold and land, even if they refuse the rest.
+
+    An action that this release does not know asks for nothing.
+    """
 
     sequence: Sequence
     operator: Name
-    safety_action: SafetyAction = field(default="none", kw_only=True)
-    robot_safety_actions: Annotated[dict[RobotKey, SafetyAction], _OfRobots] = field(
+    safety_action: Name = field(default="none", kw_only=True)
+    robot_safety_actions: Annotated[Mapping[RobotKey, Name], _OfRobots] = field(
         default_factory=dict, kw_only=True
     )
 
     def safety_action_for(self, robot_id: int) -> SafetyAction:
         """Safety action that is asked of one robot."""
-        return self.robot_safety_actions.get(str(robot_id), self.safety_action)
+        asked = self.robot_safety_actions.get(str(robot_id), self.safety_action)
+        return _SAFETY_ACTIONS.get(asked, "none")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +164,10 @@ class GroundState(SafetyRequest):
     free: nobody asked them to.
     """
 
+    safety_action: SafetyAction = field(default="none", kw_only=True)
+    robot_safety_actions: Annotated[dict[RobotKey, SafetyAction], _OfRobots] = field(
+        default_factory=dict, kw_only=True
+    )
     origin: Origin | None = None
     enabled: bool = False
     robot_enabled: Annotated[dict[RobotKey, bool], _OfRobots] = field(default_factory=dict)
@@ -185,8 +194,8 @@ class Order:
     It is for the start of the program whose `boot_nonce` it names, and expires at
     `expires_at_uptime_s` of the robot's own uptime, `ORDER_LIFETIME_S` after the status that the
     ground saw: clocks need not agree. `trial` names the mission of a start: another one than the
-    last has the explored map and the mailbox forgotten. A reset does, too; the robot's own trial is
-    then "" until it starts again.
+    last has the explored map and the neighbours' messages forgotten. A reset does, too; the robot's
+    own trial is then "" until it starts again.
 
     `pilot` gives the vehicle, which holds, to a human; `rejoin` takes it back. `disarm` stops the
     motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone. `kind` is

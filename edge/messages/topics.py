@@ -4,9 +4,14 @@ A topic's key is `lpac/<fleet>/robot/<id>/<name>` or `lpac/<fleet>/ground/<name>
 who sends what, sizes and priorities from here, and drops what is larger.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import Literal, NamedTuple, Protocol
+
+from edge.core.wire import MAX_ROBOT_ID
+
+_ROBOT_KEY = re.compile(r"robot/(0|[1-9][0-9]{0,4})/")
 
 Sender = Literal["robot", "ground"]
 Priority = Literal["now", "later"]
@@ -60,6 +65,12 @@ _STATES_HZ, _LEAST_STATE_HZ = 250.0, 2.0
 def state_hz(robots: float) -> float:
     """How often a ground says its `STATE` to so many robots, if nothing changes."""
     return min(STATE.rate_hz, max(_LEAST_STATE_HZ, _STATES_HZ / robots))
+
+
+def robot_id_in(key: str) -> int | None:
+    """Id of the robot whose key this is, below `lpac/<fleet>/`; None if it is no robot's."""
+    found = _ROBOT_KEY.match(key)
+    return int(found[1]) if found and int(found[1]) <= MAX_ROBOT_ID else None
 
 
 class Link(Protocol):

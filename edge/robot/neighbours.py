@@ -22,6 +22,7 @@ _LONGEST_TRANSIT_S = 5.0
 
 # What a robot said of itself holds for so long.
 BEACON_LASTS_S = 3.0
+MAX_MESSAGE_AGE_S = 0.8
 
 # (start, sequence): of a sender's two messages the one with the greater number is newer.
 Number = tuple[int, int]
@@ -41,6 +42,7 @@ class _Robot:
 
     number: Number
     heard: HeardBeacon
+    message_number: Number = (-1, -1)
     # Taken by the swap, and not yet.
     handed_out: ReceivedMessage | None = None
     received: ReceivedMessage | None = None
@@ -64,15 +66,18 @@ class NeighbourTable:
     Raises ValueError if `max_message_age_s` is not finite or below 0.
     """
 
-    def __init__(self, robot_id: int, max_message_age_s: float = 0.8) -> None:
+    def __init__(self, robot_id: int, max_message_age_s: float = MAX_MESSAGE_AGE_S) -> None:
         require(NonNegative, max_message_age_s, "max_message_age_s")
         self._robot_id = robot_id
         self._max_message_age_s = max_message_age_s
         # By the paper's rule, at any age.
         self._kept_s = max_message_age_s or math.inf
-        # A robot without a battery-backed clock may come back with a smaller start. Once it was
-        # silent for longer than a message can be in transit, nothing of an earlier start can still
-        # arrive, so whatever does is of a new one.
+        self._extrapolated_s = max_message_age_s or MAX_MESSAGE_AGE_S
+        # Arrival of the newest message in this robot's own name.
+        self._own_heard_at_s = -math.inf
+        # A robot without a battery-backed clock may come back with a smaller start, and a stranger
+        # may have sent a greater number in its name. After a silence that is longer than a message
+        # can be in transit, any beacon counts again, and any policy's message of another start.
         self._restart_silence_s = max(max_message_age_s, _LONGEST_TRANSIT_S)
         self._lock = Lock()
         # Outlive the messages: a late duplicate must not pass for news.
@@ -111,31 +116,36 @@ class NeighbourTable:
         age_s: float | None,
     ) -> Rejection | None:
         if beacon.robot_id == self._robot_id:
+            self._own_heard_at_s = now_s
             return Rejection.OWN
-        # Of one that may be older than any that is kept nothing is known but when it came.
-        known_s = age_s if age_s is not None and age_s < self._kept_s else 0.0
+        # The position of an older message is taken as of its arrival, not extrapolated.
+        known_s = age_s if age_s is not None and age_s < self._extrapolated_s else 0.0
         heard = HeardBeacon(beacon, now_s, now_s - known_s)
         robot = self._robots.get(beacon.robot_id)
         if robot is None:
             robot = _Robot(number, heard)
             self._robots = dict(sorted([*self._robots.items(), (beacon.robot_id, robot)]))
-        elif number > robot.number or (
-            number[0] != robot.number[0]
-            and now_s - robot.heard.heard_at_s > self._restart_silence_s
-        ):
+        silent = now_s - robot.heard.heard_at_s > self._restart_silence_s
+        is_newer = number > robot.message_number or (
+            silent and number[0] != robot.message_number[0]
+        )
+        if number > robot.number or silent:
             robot.number, robot.heard = number, heard
-        else:
+        elif robot.heard is not heard:
             _count(robot, number, age_s, is_outdated=True)
             return Rejection.OUTDATED
         _count(robot, number, age_s)
         if message is None or isinstance(message, Rejection):
             return message
+        if not is_newer:
+            return Rejection.OUTDATED
+        robot.message_number = number
         if self._max_message_age_s > 0.0:
             if age_s is None:
                 return Rejection.AGE_UNKNOWN
             if not age_s < self._max_message_age_s:
                 return Rejection.STALE
-        robot.received = ReceivedMessage(beacon, message, heard.sent_at_s)
+        robot.received = ReceivedMessage(beacon, message, now_s - (age_s or 0.0))
         robot.accepted += 1
         return None
 
@@ -169,6 +179,10 @@ class NeighbourTable:
         with self._lock:
             heard = [robot.heard for robot in self._robots.values()]
         return tuple(each for each in heard if now_s - each.heard_at_s <= max_age_s)
+
+    def is_own_id_heard(self, now_s: float) -> bool:
+        """Whether another program sent a message with this robot's id in the last seconds."""
+        return now_s - self._own_heard_at_s <= BEACON_LASTS_S
 
     def last_heard_s(self, robot_id: int) -> float:
         """When the robot was heard last; -inf if never."""

@@ -39,6 +39,7 @@ from edge.messages.topics import (
     Link,
     ReceiveCallback,
     Topic,
+    robot_id_in,
 )
 from edge.policy.family import VerifiedPolicy
 from edge.robot.config import RobotConfig
@@ -193,7 +194,9 @@ class RobotNode:
     def _receive_message(self, key: str, data: bytes, speaker: Speaker) -> None:
         """A robot's: to the table of neighbours, and what came to the log."""
         now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
-        sender = int(key.split("/")[1])
+        sender = robot_id_in(key)
+        if sender is None:
+            return
         rejection = age_s = None
         try:
             release = "" if speaker.release == self._guard.release else speaker.release.hex()
@@ -530,7 +533,8 @@ class RobotNode:
     def _is_duplicate(self) -> bool:
         robot_id = self._config.robot_id
         is_claimed = self._link is not None and self._link.is_claimed(robot_id)
-        return is_claimed or robot_id in self._guard.robots_said_twice()
+        is_heard = self._pac.table.is_own_id_heard(self._ports.clock.monotonic_s())
+        return is_claimed or is_heard or robot_id in self._guard.robots_said_twice()
 
 
 def _fields(value: RobotStatus | VehicleState | PolicyTick) -> dict[str, object]:

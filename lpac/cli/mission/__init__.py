@@ -419,7 +419,7 @@ def again(
         str, typer.Argument(metavar="[TRIAL]", help="Its name; else the next number.")
     ] = "",
 ) -> None:
-    """Begin the next trial: explored maps and mailboxes are forgotten."""
+    """Begin the next trial: explored maps and neighbours' messages are forgotten."""
     from lpac.ground.station.protocol import NextTrial
 
     to = address(of.fleet, of.robots)

@@ -711,7 +711,7 @@ class CommandTask:
         self._station.change(trial=trial)
         for name in self._open:
             self._order("reset", name, trial)
-        yield from self._answers(f"trial {trial}: map and mailbox are reset")
+        yield from self._answers(f"trial {trial}: map and neighbours' messages are reset")
 
     def _command(self, _: TakeCommand) -> Waits:
         station = self._station

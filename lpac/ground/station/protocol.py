@@ -147,7 +147,7 @@ class RobotCommand:
 
 @dataclass(frozen=True, slots=True)
 class NextTrial(Bounded):
-    """The next trial, called `trial`, or numbered on: explored maps and mailboxes are reset.
+    """The next trial, called `trial`, or numbered on: explored maps and messages are forgotten.
 
     Refused while a robot flies its mission.
     """

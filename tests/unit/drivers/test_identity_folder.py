@@ -1,13 +1,15 @@
 """Keys, certificates and the list of members as they lie on the disk."""
 
+import errno
 import stat
 from pathlib import Path
 
 import pytest
 
 from edge.core.schema import ConfigError
+from edge.drivers import identity_folder
 from edge.drivers.identity_folder import GROUP_KEYS, MEMBERS, load_identity
-from edge.identity.members import Role
+from edge.identity.members import Members, Role
 from lpac.fleet.authority import (
     Authority,
     AuthorityError,
@@ -97,6 +99,27 @@ def test_a_list_that_cannot_be_used_changes_nothing_and_is_told_once(
     give_list(authority, folder)
     identity.take_up(guard)
     assert guard.members == authority.members
+
+
+def test_a_list_that_could_not_be_read_once_is_read_again(
+    authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "r3"
+    new_member(authority, folder, Role.ROBOT, "r3", 3)
+    identity = load_identity(folder, fleet="demo", unix_s=2e9)
+    guard = identity.guard(lambda: 0.0)
+    new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
+    give_list(authority, folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(identity_folder, "read_members", _too_many_open_files)
+        identity.take_up(guard)
+    assert guard.members != authority.members
+    identity.take_up(guard)
+    assert guard.members == authority.members
+
+
+def _too_many_open_files(_: Path) -> Members:
+    raise OSError(errno.EMFILE, "Too many open files")
 
 
 def test_a_start_that_was_numbered_anew_stays_so_while_the_program_runs(

@@ -206,7 +206,6 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
     ),
     ({"slot_height_m": 26.0}, _C.HEIGHT_OUTSIDE, "slot height is 26 m"),
     ({"duplicate_id": True}, _C.DUPLICATE_ID, "another program says that it is robot 1: stop it"),
-    ({"robot_id": 2}, _C.DUPLICATE_ID, "another program says that it is robot 2"),
     ({"bundle_id": "c"}, _C.OTHER_BUNDLE, "robot 2 has another bundle: deploy one to all"),
     ({"world_id": "v"}, _C.OTHER_WORLD, "robot 2 has another world: set one on the ground"),
     ({"origin": Origin(47.4, 8.5, 91.0)}, _C.OTHER_ORIGIN, "robot 2 has another mission origin"),

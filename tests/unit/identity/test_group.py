@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.identity.envelope import HEAD_BYTES, enclose
+from edge.identity.envelope import HEAD_BYTES, enclose, is_of_other_version
 from edge.identity.group import (
     DATAGRAM_BYTES,
     MOST_BYTES,
@@ -18,7 +18,7 @@ from edge.identity.group import (
     key_of_open_fleet,
     open_datagram,
 )
-from edge.identity.news import MessageNumber
+from edge.identity.news import NOTHING, MessageNumber
 
 KEY, FORMER, ANOTHER = (GroupKey.of(bytes([n]) * 32) for n in range(3))
 numbers = st.builds(MessageNumber, st.integers(0, 2**48 - 1), st.integers(0, 2**32 - 1))
@@ -161,6 +161,14 @@ def test_an_open_fleets_robot_may_come_back_with_an_earlier_clock() -> None:
         assert comes_through(assembly, 1, start=2, now_s=0.0)
         assert not comes_through(assembly, 1, start=1, now_s=4.9)
         assert comes_through(assembly, 1, start=1, now_s=5.1) is comes
+
+
+def test_of_an_envelope_of_another_version_the_sender_is_known() -> None:
+    (datagram,) = datagrams(b"LE\xff" + bytes(HEAD_BYTES), sender=7, key=KEY)
+    fragment = open_datagram(datagram, (KEY,))
+    assert fragment is not None
+    assert (fragment.sender, fragment.number) == (7, NOTHING)
+    assert is_of_other_version(fragment.head)
 
 
 def test_what_has_no_envelope_does_not_come_through() -> None:

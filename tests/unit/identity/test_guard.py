@@ -460,3 +460,16 @@ def test_a_knock_counts_once_and_of_members_alone(one: Member) -> None:
 @given(st.binary(max_size=300))
 def test_no_bytes_are_a_knock(data: bytes) -> None:
     assert not robot(1).guard.is_knock(data, PLACE)
+
+
+@pytest.mark.parametrize("robot", ["x", "-1", "03", "65536", "99999999", ""])
+def test_a_key_that_is_no_robots_is_refused(robot: str) -> None:
+    heard: list[object] = []
+    guard = Unguarded(start=1)
+    subscriptions = guard.subscriptions({MESSAGE: lambda *said: heard.append(said)})
+    for data in (guard.seal(MESSAGE, b"hi"), b"LE\xff"):
+        assert subscriptions[MESSAGE](f"robot/{robot}/message", data) is False
+    assert not heard and not guard.take_strangers()
+    assert subscriptions[MESSAGE]("robot/65535/message", guard.seal(MESSAGE, b"hi"))
+    assert subscriptions[MESSAGE]("robot/3/message", b"LE\xff") is False
+    assert len(heard) == 1 and guard.take_strangers() == {3}

@@ -261,6 +261,9 @@ def test_hold_and_land_are_understood_whatever_else_a_state_says() -> None:
     request = decode(SafetyRequest, data)
     assert [request.safety_action_for(robot) for robot in (3, 4)] == ["land", "hold"]
     assert (request.sequence, request.operator) == (7, "anna")
+    told["robot_safety_actions"] |= {"2": "dodge"}
+    request = decode(SafetyRequest, json.dumps(told).encode())
+    assert [request.safety_action_for(robot) for robot in (2, 3)] == ["none", "land"]
 
 
 RECORDED = Path(__file__).parent / "recorded"

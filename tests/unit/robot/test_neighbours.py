@@ -283,6 +283,7 @@ class AgainstHistory(RuleBasedStateMachine):
         self.now_s = 0.0
         self.accepted: list[Accepted] = []
         self.heard: dict[int, tuple[Said, float]] = {}
+        self.numbers: dict[int, tuple[int, int]] = {}
         self.cleared = 0
         self.swaps = 0
         self.counts: Counter[str] = Counter()
@@ -303,7 +304,7 @@ class AgainstHistory(RuleBasedStateMachine):
         expected: Rejection | None = None
         if robot_id == OWN_ID:
             expected = Rejection.OWN
-        elif robot_id in self.heard and not self.is_news(sent, *self.heard[robot_id]):
+        elif not self.is_news(sent):
             expected = Rejection.OUTDATED
         elif self.limit_s > 0 and age_s is None:
             expected = Rejection.AGE_UNKNOWN
@@ -313,14 +314,24 @@ class AgainstHistory(RuleBasedStateMachine):
             born_s = self.now_s - (age_s or 0.0)
             self.accepted.append(Accepted(sent, self.now_s, born_s, self.swaps))
         if expected not in (Rejection.OWN, Rejection.OUTDATED):
+            self.numbers[robot_id] = sent.number
+        if robot_id != OWN_ID and self.is_news_as_beacon(sent):
             self.heard[robot_id] = sent, self.now_s
         assert receive(self.table, sent, self.now_s, age_s) is expected
         self.counts["accepted" if expected is None else expected.value] += 1
 
-    def is_news(self, sent: Said, last: Said, at_s: float) -> bool:
-        if sent.number[0] == last.number[0]:
-            return sent.number > last.number
-        return sent.number > last.number or self.now_s - at_s > max(self.limit_s, 5.0)
+    def is_news(self, sent: Said) -> bool:
+        if sent.number > self.numbers.get(sent.beacon.robot_id, (0, 0)):
+            return self.is_news_as_beacon(sent)
+        return self.is_silent(sent) and sent.number[0] != self.numbers[sent.beacon.robot_id][0]
+
+    def is_news_as_beacon(self, sent: Said) -> bool:
+        last = self.heard.get(sent.beacon.robot_id)
+        return last is None or sent.number > last[0].number or self.is_silent(sent)
+
+    def is_silent(self, sent: Said) -> bool:
+        last = self.heard.get(sent.beacon.robot_id)
+        return last is not None and self.now_s - last[1] > max(self.limit_s, 5.0)
 
     def newest(self, since_swap: int) -> dict[int, Accepted]:
         """By robot id: what may be handed out, of all that was accepted since that swap."""
@@ -372,6 +383,22 @@ class AgainstHistory(RuleBasedStateMachine):
     @invariant()
     def counts_add_up(self) -> None:
         assert Counter(self.table.counts()) == self.counts
+
+
+def test_a_number_far_ahead_silences_a_robot_for_five_seconds_only() -> None:
+    table = NeighbourTable(OWN_ID)
+    receive(table, message(1, 2**32 - 1), now_s=0.0)
+    for sequence in range(16):
+        receive(table, message(1, sequence), now_s=sequence / 2.5)
+    beacons = [heard.beacon for heard in table.heard(6.0, 1.0)]
+    assert beacons == [message(1, 15).beacon]
+
+
+def test_a_message_in_this_robots_own_name_is_noticed() -> None:
+    table = NeighbourTable(OWN_ID)
+    assert not table.is_own_id_heard(0.0)
+    assert receive(table, message(OWN_ID, 1), now_s=10.0) is Rejection.OWN
+    assert table.is_own_id_heard(13.0) and not table.is_own_id_heard(13.1)
 
 
 TestAgainstHistory = AgainstHistory.TestCase
