@@ -26,6 +26,7 @@ MAX_MESSAGE_AGE_S = 0.8
 
 # (start, sequence): of a sender's two messages the one with the greater number is newer.
 Number = tuple[int, int]
+_NO_NUMBER: Number = (-1, -1)
 
 
 class ReceivedMessage(NamedTuple):
@@ -42,7 +43,7 @@ class _Robot:
 
     number: Number
     heard: HeardBeacon
-    message_number: Number = (-1, -1)
+    message_number: Number = _NO_NUMBER
     # Taken by the swap, and not yet.
     handed_out: ReceivedMessage | None = None
     received: ReceivedMessage | None = None
@@ -126,9 +127,8 @@ class NeighbourTable:
             robot = _Robot(number, heard)
             self._robots = dict(sorted([*self._robots.items(), (beacon.robot_id, robot)]))
         silent = now_s - robot.heard.heard_at_s > self._restart_silence_s
-        is_newer = number > robot.message_number or (
-            silent and number[0] != robot.message_number[0]
-        )
+        if silent and number[0] != robot.message_number[0]:
+            robot.message_number = _NO_NUMBER
         if number > robot.number or silent:
             robot.number, robot.heard = number, heard
         elif robot.heard is not heard:
@@ -137,7 +137,7 @@ class NeighbourTable:
         _count(robot, number, age_s)
         if message is None or isinstance(message, Rejection):
             return message
-        if not is_newer:
+        if not number > robot.message_number:
             return Rejection.OUTDATED
         robot.message_number = number
         if self._max_message_age_s > 0.0:

@@ -304,7 +304,7 @@ class AgainstHistory(RuleBasedStateMachine):
         expected: Rejection | None = None
         if robot_id == OWN_ID:
             expected = Rejection.OWN
-        elif not self.is_news(sent):
+        elif not self.is_news(sent) and not self.begins_anew(sent):
             expected = Rejection.OUTDATED
         elif self.limit_s > 0 and age_s is None:
             expected = Rejection.AGE_UNKNOWN
@@ -321,13 +321,16 @@ class AgainstHistory(RuleBasedStateMachine):
         self.counts["accepted" if expected is None else expected.value] += 1
 
     def is_news(self, sent: Said) -> bool:
-        if sent.number > self.numbers.get(sent.beacon.robot_id, (0, 0)):
-            return self.is_news_as_beacon(sent)
-        return self.is_silent(sent) and sent.number[0] != self.numbers[sent.beacon.robot_id][0]
+        last = self.numbers.get(sent.beacon.robot_id, (0, 0))
+        return self.is_news_as_beacon(sent) and sent.number > last
 
     def is_news_as_beacon(self, sent: Said) -> bool:
         last = self.heard.get(sent.beacon.robot_id)
         return last is None or sent.number > last[0].number or self.is_silent(sent)
+
+    def begins_anew(self, sent: Said) -> bool:
+        last = self.numbers.get(sent.beacon.robot_id)
+        return self.is_silent(sent) and last is not None and sent.number[0] != last[0]
 
     def is_silent(self, sent: Said) -> bool:
         last = self.heard.get(sent.beacon.robot_id)
@@ -399,6 +402,14 @@ def test_a_message_in_this_robots_own_name_is_noticed() -> None:
     assert not table.is_own_id_heard(0.0)
     assert receive(table, message(OWN_ID, 1), now_s=10.0) is Rejection.OWN
     assert table.is_own_id_heard(13.0) and not table.is_own_id_heard(13.1)
+
+
+def test_a_start_with_an_earlier_clock_is_heard_after_a_beacon_alone() -> None:
+    table = NeighbourTable(OWN_ID)
+    assert receive(table, message(1, 9, start=3)) is None
+    alone = message(1, 1, start=2)
+    assert table.receive(alone.beacon, alone.number, None, 6.0, 0.0) is None
+    assert receive(table, message(1, 2, start=2), now_s=6.4) is None
 
 
 TestAgainstHistory = AgainstHistory.TestCase
