@@ -173,9 +173,10 @@ class Authority:
     def _write(self, members: tuple[Member, ...], *, renew_group_key: bool = True) -> None:
         now = self.members
         later = replace(now, number=now.number + 1, members=members)
-        write_file(self.folder / MEMBERS, later.text.encode(), 0o644)
+        # First, since a repeat finds nobody to remove once the list is written.
         if renew_group_key and _robot_keys(now) - _robot_keys(later):
             self._renew_group_key()
+        write_file(self.folder / MEMBERS, later.text.encode(), 0o644)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 from edge.core.schema import ConfigError
 from edge.drivers.identity_folder import (
     AUTHORITY_PEM,
+    CERTIFICATE_PEM,
     GROUP_KEYS,
     KEY_PEM,
     MEMBERS,
@@ -23,7 +24,8 @@ from lpac.fleet.settings import FleetConfig, RobotHost
 
 # As `edge.drivers.identity_folder` reads it; the program sees it below /var/lib/lpac. The names
 # are as systemd makes them for a DynamicUser=.
-_IDENTITY, _NEXT_KEY = "/var/lib/private/lpac/identity", "next-key.pem"
+_IDENTITY = "/var/lib/private/lpac/identity"
+_NEXT_KEY, _NEXT_CERTIFICATE = "next-key.pem", "next-certificate.pem"
 
 
 class Joined(NamedTuple):
@@ -61,21 +63,21 @@ async def join(
     """See that the robot is a member with the key that is on it; the session has its lock.
 
     The first robot makes the authority, with `operator` as this computer's name.
-    Raises FleetError, AuthorityError or OSError.
+    Raises FleetError, also if it is no member yet and flies, AuthorityError or OSError.
     """
     if config.keys is None:
         return Joined(None, None)
     new = None if config.keys.exists() else config.keys
     authority = open_authority(config) if new is None else init(config, operator())
-    public_key = await _public_key(session, fresh=False)
-    member = Member(Role.ROBOT, robot.name, robot.robot_id, public_key)
-    files = authority.files(member)
-    knows = (await _digests(session)).get(AUTHORITY_PEM) == _sha256(files[AUTHORITY_PEM])
-    if member in authority.members.members and knows:
-        await bring_members(session, config)
-        return Joined("was so already", new)
-    issued = authority.issue(Role.ROBOT, robot.name, public_key, robot.robot_id)
-    await _write_member(session, robot, issued.files, fresh=False)
+    digests = await _digests(session)
+    authority_pem = (authority.folder / AUTHORITY_PEM).read_bytes()
+    knows = digests.get(AUTHORITY_PEM) == _sha256(authority_pem)
+    if knows and {KEY_PEM, MEMBERS} <= digests.keys():
+        member = _member(robot, await _public_key(session, fresh=False))
+        if member in authority.members.members:
+            await bring_members(session, config)
+            return Joined("was so already", new)
+    await _admit(session, authority, robot, fresh=False)
     return Joined("done", new)
 
 
@@ -86,11 +88,7 @@ async def renew_key(config: FleetConfig, robot: RobotHost, report: Report) -> No
     """
     authority = open_authority(config)
     async with hold(config, robot, report) as (session, found, _):
-        made = await _public_key(session, fresh=True)
-        issued = authority.issue(
-            Role.ROBOT, robot.name, made, robot.robot_id, renew_group_key=False
-        )
-        await _write_member(session, robot, issued.files, fresh=True)
+        await _admit(session, authority, robot, fresh=True)
         if found["service"]["active"] == "active":
             await restart(session, config, robot, in_flight=False)
 
@@ -135,18 +133,28 @@ async def bring_members_to(config: FleetConfig, robot: RobotHost, report: Report
         await bring_members(session, config)
 
 
-async def _write_member(
-    session: Session, robot: RobotHost, files: dict[str, bytes], *, fresh: bool
-) -> None:
-    """Write what belongs to the key, `fresh` or not. The robot's program reads it when it starts.
+async def _admit(session: Session, authority: Authority, robot: RobotHost, *, fresh: bool) -> None:
+    """Put the robot's key, a `fresh` one or its own, on the list; its program reads it at a start.
 
-    The key last: until then the robot is no member by the new one, and a repeat mends it.
+    On the list is only a key that the robot has: it takes a fresh one, with its certificate, first.
+    A repeat mends what a lost connection left. Raises as `join`.
     """
     await session.call("require_lock")
     await require_disarmed(session, robot, "a new key")
-    await _write(session, files)
+    public_key = await _public_key(session, fresh=fresh)
     if fresh:
-        await session.must("mv", f"{_IDENTITY}/{_NEXT_KEY}", f"{_IDENTITY}/{KEY_PEM}")
+        files = authority.files(_member(robot, public_key))
+        await _write(session, {_NEXT_CERTIFICATE: files[CERTIFICATE_PEM]})
+        await session.must("sh", "-c", f"""cd {_IDENTITY} && mv {_NEXT_KEY} {KEY_PEM} &&
+mv {_NEXT_CERTIFICATE} {CERTIFICATE_PEM}""")  # fmt: skip
+    issued = authority.issue(
+        Role.ROBOT, robot.name, public_key, robot.robot_id, renew_group_key=not fresh
+    )
+    await _write(session, issued.files)
+
+
+def _member(robot: RobotHost, public_key: bytes) -> Member:
+    return Member(Role.ROBOT, robot.name, robot.robot_id, public_key)
 
 
 async def _write(session: Session, files: Mapping[str, bytes]) -> None:
@@ -156,7 +164,7 @@ async def _write(session: Session, files: Mapping[str, bytes]) -> None:
 async def _public_key(session: Session, *, fresh: bool) -> bytes:
     """The public key of the robot, whose secret key is made there and never leaves.
 
-    With `fresh` it is another one than before, which counts once `_write_member` brings the rest.
+    With `fresh` it is another one than before, which counts once `_admit` brings the rest.
     """
     key = _NEXT_KEY if fresh else KEY_PEM
     pem = await session.must("sh", "-c", f"""set -eC; umask 077; mkdir -p {_IDENTITY}
@@ -171,9 +179,12 @@ chown -R --no-dereference --reference=.. .; openssl pkey -in {key} -pubout""")  
 
 
 async def _digests(session: Session) -> dict[str, str]:
-    """The sha256 of each file of the robot's identity, in hexadecimal."""
-    said = (await session.look({"": f"cd {_IDENTITY} && sha256sum *"}))[""]
-    return {line[66:]: line[:64] for line in said.splitlines()}
+    """The sha256 of each file of the robot's identity, in hexadecimal. Raises as `must`."""
+    # Not of what its program replaces meanwhile.
+    named = f"-name '*.pem' -o -name {MEMBERS} -o -name {GROUP_KEYS}"
+    find = f"find {_IDENTITY} -type f '(' {named} ')' -exec sha256sum {{}} +"
+    said = await session.must("sh", "-c", f"[ ! -d {_IDENTITY} ] || {find}")
+    return {line.rpartition("/")[2]: line[:64] for line in said.splitlines()}
 
 
 def _sha256(data: bytes) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lpac.fleet import agent, members, probes, up
+from lpac.fleet.authority import create_authority
 from lpac.fleet.settings import load_fleet
 from tests.conftest import ROOT
 from tests.local_session import LocalSession
@@ -58,6 +59,7 @@ def test_a_robots_key_is_made_on_it_and_replaced_with_what_belongs_to_it(
     monkeypatch.setattr(agent, "_lock", [0])
     monkeypatch.setattr(agent, "armed", lambda _: False)
     robot = load_fleet(ROOT / "docs" / "fleet.toml").robots["r1"]
+    authority = create_authority(tmp_path / "keys", "demo")
     session = LocalSession()
 
     def public_key(*, fresh: bool) -> bytes:
@@ -67,17 +69,16 @@ def test_a_robots_key_is_made_on_it_and_replaced_with_what_belongs_to_it(
     key = (folder / "key.pem").read_bytes()
     assert (folder / "key.pem").stat().st_mode & 0o777 == 0o600
     assert first == public_key(fresh=False)
-    second = public_key(fresh=True)
-    assert second != first and (folder / "key.pem").read_bytes() == key
+    assert public_key(fresh=True) != first and (folder / "key.pem").read_bytes() == key
     # The program's user may have put a link there for root to follow.
     others.write_text("theirs")
     (folder / "certificate.pem.part").symlink_to(others)
-    data = os.urandom(5000)
-    files = {"certificate.pem": data, "authority.pem": b""}
-    asyncio.run(members._write_member(session, robot, files, fresh=True))
-    assert public_key(fresh=False) == second
-    assert others.read_text() == "theirs" and (folder / "certificate.pem").read_bytes() == data
+    asyncio.run(members._admit(session, authority, robot, fresh=True))
+    (member,) = authority.members.members
+    assert public_key(fresh=False) == member.public_key != first
+    files = {"certificate.pem", "authority.pem", "group-keys", "members"}
+    assert others.read_text() == "theirs" and not (folder / "certificate.pem").is_symlink()
     assert {path.name for path in folder.iterdir()} == {"key.pem", *files}
     assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {0o600}
     digests = asyncio.run(members._digests(session))
-    assert digests["certificate.pem"] == members._sha256(data)
+    assert digests["certificate.pem"] == members._sha256((folder / "certificate.pem").read_bytes())

@@ -278,6 +278,28 @@ def test_a_member_that_gets_a_new_key_loses_the_old_one(
     assert known() == []
 
 
+def test_a_revocation_that_breaks_off_is_repeated(
+    authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    new_member(authority, tmp_path / "r3", Role.ROBOT, "r3", 3)
+    before = (authority.folder / GROUP_KEYS).read_text()
+    written: list[Path] = []
+
+    def breaks_off(path: Path, data: bytes, mode: int) -> None:
+        if written:
+            raise OSError("the disk is full")
+        written.append(path)
+        write_file(path, data, mode)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("lpac.fleet.authority.write_file", breaks_off)
+        with pytest.raises(OSError, match="the disk is full"):
+            authority.revoke("r3")
+    authority.revoke("r3")
+    assert not authority.members.members
+    assert before not in (authority.folder / GROUP_KEYS).read_text()
+
+
 def test_an_authority_says_what_it_cannot_do(authority: Authority, tmp_path: Path) -> None:
     with pytest.raises(AuthorityError, match="has an authority already"):
         create_authority(authority.folder, "demo")

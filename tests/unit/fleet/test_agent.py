@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from edge.drivers.px4 import raw_mavlink
 from lpac.fleet import agent, deploy, members, program, pull, setup, up
 from lpac.fleet.agent import Refused, write_whole
+from lpac.fleet.authority import create_authority
 from lpac.fleet.hold import Held, earlier_than
 from lpac.fleet.release import Image, Release, _entry
 from lpac.fleet.session import Done, RemoteError
@@ -201,13 +202,19 @@ def test_a_robot_in_flight_is_left_as_it_is(
 def test_a_robot_that_flies_or_is_not_held_keeps_what_it_has(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    folder = tmp_path / "opt"
+    make(folder / "releases" / "1", {"robot.toml": ""})
+    authority = create_authority(tmp_path / "keys", CONFIG.fleet)
+
     def refused(why: str) -> None:
         robot = Robot()
         with pytest.raises(Refused, match=why):
-            agent.switch(str(tmp_path), "1", PORT)
-        with pytest.raises(RemoteError, match=why):
-            asyncio.run(members._write_member(robot, R1, {}, fresh=False))
-        assert not robot.changed and not list(tmp_path.iterdir())
+            agent.switch(str(folder), "1", PORT)
+        for fresh in (False, True):
+            with pytest.raises(RemoteError, match=why):
+                asyncio.run(members._admit(robot, authority, R1, fresh=fresh))
+        assert not robot.changed and not authority.members.members
+        assert [path.name for path in folder.iterdir()] == ["releases"]
 
     refused("lock was not called")
     monkeypatch.setattr(agent, "armed", lambda _: True)
