@@ -22,7 +22,6 @@ import socket
 import stat
 import struct
 import subprocess
-import sys
 import time
 import traceback
 from typing import Any, Callable, Dict, List, Optional, Tuple
@@ -46,6 +45,7 @@ _HEALTHY_S, _STEADY_S = 40.0, 2.0
 # PX4 sends heartbeats at 1 Hz.
 _HEARTBEAT_WAIT_S = 2.5
 _IP = 0x0800
+_ARMED = "the vehicle is armed by now: nothing is restarted in flight, and the switch is pending"
 
 Result = Dict[str, Any]
 _CALLS = {}  # type: Dict[str, Callable[..., Result]]
@@ -79,7 +79,7 @@ def serve() -> None:
                 _send({"error": " ".join(str(error).split())})
             except Exception as error:
                 # A mistake of ours: the one who reads it needs the place.
-                place = traceback.extract_tb(sys.exc_info()[2])[-1]
+                place = traceback.extract_tb(error.__traceback__)[-1]
                 _send({"error": "%s: %s (line %s)" % (type(error).__name__, error, place[1])})
 
 
@@ -94,10 +94,7 @@ def _send(message: Result) -> None:
 
 @call
 def run(command: List[str], timeout_s: float = 10.0) -> Result:
-    """Run a program: its exit `code`, and `out` and `err` that it wrote.
-
-    Raises Refused if it is not there, or does not end in time.
-    """
+    """Run a program: its exit `code`, `out`, `err`. Raises Refused if it is missing, or hangs."""
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -143,9 +140,6 @@ def write_whole(path: str, data: bytes, mode: int = 0o644) -> None:
     os.replace(part, path)
 
 
-# The program and the vehicle
-
-
 @call
 def service() -> Result:
     """State of the unit by systemd, and the program's own last words (`status`, None if none).
@@ -189,9 +183,8 @@ def armed(mavlink_port: int) -> bool:
     had lost the vehicle by then, the vehicle's own word counts first.
     """
     state = service()
-    status = {}  # type: Result
-    if state["active"] in ("active", "reloading", "deactivating"):
-        status = state["status"] or {}
+    runs = state["active"] in ("active", "reloading", "deactivating")
+    status = (state["status"] if runs else None) or {}  # type: Result
     if status.get("autopilot") and status.get("armed") is not None:
         return bool(status["armed"])
     beat = hear_heartbeat(mavlink_port)["heartbeat"]
@@ -298,9 +291,6 @@ def last_words() -> Result:
     return {"text": "see `lpac fleet logs`"}
 
 
-# Releases
-
-
 @call
 def lock(directory: str, who: str, mavlink_port: int) -> Result:
     """Hold the robot for this session alone, and finish a switch that was interrupted.
@@ -331,18 +321,20 @@ def require_lock() -> Result:
 @call
 def check(folder: str) -> Result:
     """Raises Refused if a file is not what the release's manifest says, or there are others."""
-    with open(os.path.join(folder, "manifest.json"), "rb") as manifest:
-        wanted = json.loads(manifest.read().decode())["files"]
+    try:
+        with open(os.path.join(folder, "manifest.json"), "rb") as manifest:
+            wanted = dict(json.loads(manifest.read().decode())["files"])
+    except (ValueError, KeyError, TypeError):
+        raise Refused("manifest.json is not whole: deploy again") from None
     found = {}
     for parent, folders, files in os.walk(folder):
         for name in folders + files:
             path = os.path.join(parent, name)
-            info = os.lstat(path)
-            if stat.S_ISLNK(info.st_mode):
-                found[os.path.relpath(path, folder)] = ["link", os.readlink(path)]
-            elif not stat.S_ISDIR(info.st_mode):
-                entry = [oct(stat.S_IMODE(info.st_mode)), _sha256(path)]
-                found[os.path.relpath(path, folder)] = entry
+            entry, mode = os.path.relpath(path, folder), os.lstat(path).st_mode
+            if stat.S_ISLNK(mode):
+                found[entry] = ["link", os.readlink(path)]
+            elif not stat.S_ISDIR(mode):
+                found[entry] = [oct(stat.S_IMODE(mode)), _sha256(path)]
     del found["manifest.json"]
     for name in sorted(set(wanted) | set(found)):
         if wanted.get(name) != found.get(name):
@@ -355,41 +347,44 @@ def switch(directory: str, release: str, mavlink_port: int) -> Result:
     """Run `releases/RELEASE` if its program turns out well; else the former one again.
 
     One without robot.toml, a spare's, becomes current and nothing is started. Raises Refused if the
-    vehicle is armed, or if the release did not run well, with the reason.
+    vehicle is armed, also by then, or if the release did not run well, with the reason.
     """
     require_lock()
+    check(os.path.join(directory, "releases", release))
     require_disarmed(mavlink_port, "switching")
     former = linked(directory)
     pending = json.dumps({"release": release, "former": former})
     write_whole(os.path.join(directory, "pending"), pending.encode())
-    problem = _activate(directory, release)
-    if problem is not None:
+    problem = _activate(directory, release, mavlink_port)
+    if problem not in (None, _ARMED):
         back = _take_back(directory, former, mavlink_port)
-        raise Refused("%s does not run well (%s); %s" % (_id(directory, release), problem, back))
+        problem = "%s does not run well (%s); %s" % (_id(directory, release), problem, back)
+    if problem is not None:
+        raise Refused(problem)
     _settle(directory)
     return {}
 
 
-def _activate(directory: str, release: str) -> Optional[str]:
+def _activate(directory: str, release: str, mavlink_port: int) -> Optional[str]:
     """Check, switch and restart; why the program does not run well then, None if it does."""
     folder, link = os.path.join(directory, "releases", release), os.path.join(directory, "current")
     try:
         check(folder)
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(link + ".part")
-        os.symlink(os.path.join("releases", release), link + ".part")
+        must("ln", "-sfn", os.path.join("releases", release), link + ".part")
         os.replace(link + ".part", link)
         _sync(directory)
         _install_units(directory, folder)
+        former = service()["invocation"]
+        if armed(mavlink_port):  # All of that may have taken minutes.
+            return _ARMED
         if not os.path.exists(os.path.join(folder, "robot.toml")):
             run(["systemctl", "disable", "--now", UNIT])
             return None
         _send({"progress": "restart"})
         run(["systemctl", "reset-failed", UNIT])
-        must("systemctl", "enable", UNIT)
-        former = service()["invocation"]
         # A program that cannot start shows in its health, with the reason.
         run(["systemctl", "restart", UNIT], 90.0)
+        must("systemctl", "enable", UNIT)
         if former and service()["invocation"] == former:
             return "it was not restarted: see `systemctl status lpac-robot` on the robot"
         _send({"progress": "health"})
@@ -397,6 +392,8 @@ def _activate(directory: str, release: str) -> Optional[str]:
         return None
     except (Refused, OSError) as error:
         return str(error)
+    except (KeyError, TypeError) as error:
+        return "its status cannot be read: %r" % error
 
 
 def _install_units(directory: str, folder: str) -> None:
@@ -419,14 +416,17 @@ def _install_units(directory: str, folder: str) -> None:
 def _take_back(directory: str, former: Optional[str], mavlink_port: int) -> str:
     """Run the former release again; what came of it. The change is settled by that."""
     if armed(mavlink_port):
-        return "the vehicle is armed by now: nothing is restarted in flight"
+        return _ARMED
     _send({"progress": "rollback"})
     if former is None:
         run(["systemctl", "disable", "--now", UNIT])
-        os.unlink(os.path.join(directory, "current"))
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(os.path.join(directory, "current"))
         back = "nothing runs: it was the robot's first release"
     else:
-        problem, name = _activate(directory, former), _id(directory, former)
+        problem, name = _activate(directory, former, mavlink_port), _id(directory, former)
+        if problem == _ARMED:
+            return problem
         back = "the robot runs %s again" % name
         if problem is not None:
             back = "%s, to which it was taken back, does not run well either: %s" % (name, problem)
@@ -449,25 +449,25 @@ def _recover(directory: str, mavlink_port: int) -> Optional[str]:
     current = linked(directory)
     try:
         with open(os.path.join(directory, "pending")) as file:
-            pending = dict(json.load(file))
-    except (OSError, ValueError):
+            pending = json.load(file)
+        wanted, former = pending["release"], pending["former"]
+    except (OSError, ValueError, KeyError, TypeError):
         return None
-    if armed(mavlink_port):
-        name = _id(directory, pending["release"])
-        return "a switch to %s was interrupted; nothing is restarted in flight" % name
     if current is None:
         _settle(directory)
         return None
     _send({"progress": "finish an interrupted switch"})
-    problem, name = _activate(directory, current), _id(directory, current)
-    if problem is None:
-        _settle(directory)
-        return "an interrupted switch was finished: the robot runs %s" % name
-    if current == pending["release"] and pending["former"] != current:
-        problem = "%s; %s" % (problem, _take_back(directory, pending["former"], mavlink_port))
+    name = _id(directory, current)
+    problem = _ARMED if armed(mavlink_port) else _activate(directory, current, mavlink_port)
+    if problem == _ARMED:
+        return "a switch to %s was interrupted; %s" % (_id(directory, wanted), problem)
+    ill = "%s does not run well (%s)" % (name, problem)
+    end = ill if problem is not None else "the robot runs %s" % name
+    if problem is not None and current == wanted and former != current:
+        end = "%s; %s" % (end, _take_back(directory, former, mavlink_port))
     else:
         _settle(directory)
-    return "an interrupted switch was finished: %s does not run well (%s)" % (name, problem)
+    return "an interrupted switch was finished: " + end
 
 
 def linked(directory: str) -> Optional[str]:

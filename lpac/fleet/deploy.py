@@ -74,7 +74,7 @@ async def deploy(
         steps = await _prove(session, release, incoming, report)
         report("switch", None)
         await require_disarmed(session, robot, "switching")
-        await _switch(session, config, robot, release, before, incoming)
+        await _switch(session, config, robot, release, before, kept, incoming)
         summary = "spare, not started" if spare else "runs"
         perceive_ms, infer_ms = steps["perceive"]["p99_ms"], steps["infer"]["p99_ms"]
         return Deployed(release.id, summary, sent_bytes, perceive_ms, infer_ms)
@@ -95,21 +95,23 @@ async def _make_room(
 
     The releases that are kept meanwhile. Raises RemoteError if the disk has no room.
     """
+    number, current = found["number"], f"{config.directory}/current/manifest.json"
+    if number is None and (await session.run("test", "-e", current)).code == 0:
+        raise RemoteError("its current release was not read, so that none is removed: try again")
     await session.must("mkdir", "-p", incoming, f"{config.directory}/releases")
     others = ("-mindepth", "1", "-maxdepth", "1", "!", "-name", release.id, "-exec", "rm", "-rf")
     await session.must("find", f"{config.directory}/incoming", *others, "{}", "+")
     # One that did not run well may be left, or that a rollback left behind.
-    names, number = found["releases"], found["number"]
+    names = found["releases"]
     newer = next((name for name in names if name != number), None)
     kept = {number, earlier_than(number, names) or newer} - {None}
     await _keep(session, config, names, kept)
-    said = await session.look({
-        "came": f"du -sb {incoming}", "free": f"df -B1 --output=avail {incoming} | tail -n 1",
-    })  # fmt: skip
+    came = await session.must("du", "-sb", incoming)
+    free = await session.must("df", "-B1", "--output=avail", incoming)
     needed_mb = _MARGIN_MB
     if not any(names[name]["image"] == release.image.id for name in kept):
-        needed_mb += max(0.0, release.size_bytes - float(said["came"].split()[0])) / 1e6
-    free_mb = float(said["free"]) / 1e6
+        needed_mb += max(0.0, release.size_bytes - float(came.split()[0])) / 1e6
+    free_mb = float(free.split()[-1]) / 1e6
     if free_mb < needed_mb:
         raise RemoteError(
             f"the disk has {free_mb:.0f} MB free, and the release needs {needed_mb:.0f} MB: remove "
@@ -176,9 +178,10 @@ async def _switch(
     robot: RobotHost,
     release: Release,
     before: dict[str, Any],
+    kept: Set[str],
     incoming: str,
 ) -> None:
-    """Run the release that has come; it and the one before it are kept."""
+    """Run the release that has come; of those that were `kept`, keep the one before it."""
     releases = before["releases"]
     number = max([release.number, *(int(name) + 1 for name in releases if name.isdigit())])
     place = f"{config.directory}/releases"
@@ -188,16 +191,19 @@ async def _switch(
                        mavlink_port=robot.mavlink_port)  # fmt: skip
     same = before["current"] == release.id
     former = earlier_than(before["number"], releases) if same else before["number"]
-    await _keep(session, config, releases, {former})
+    await _keep(session, config, kept, {former})
 
 
 async def _keep(
     session: Session, config: FleetConfig, names: Iterable[str], kept: Set[str | None]
 ) -> None:
     """Remove the other releases of these names."""
-    gone = [f"{config.directory}/releases/{name}" for name in names if name not in kept]
+    gone = [name for name in names if name not in kept]
     if gone:
-        await session.must("rm", "-rf", *gone)
+        # What is removed by half is no release any more.
+        incoming, place = f"{config.directory}/incoming", f"{config.directory}/releases"
+        await session.must("mv", "-t", incoming, *(f"{place}/{name}" for name in gone))
+        await session.must("rm", "-rf", *(f"{incoming}/{name}" for name in gone))
 
 
 async def rollback(config: FleetConfig, robot: RobotHost, report: Report) -> str:

@@ -442,6 +442,8 @@ def _system(its: _Judged) -> Finding:
 
 
 def _disk(its: _Judged) -> Finding:
+    if not its.facts["disks"]:
+        return skipped("df says nothing")
     least = min(its.facts["disks"], key=lambda disk: float(disk["free_bytes"]))
     free_mb, total_mb = least["free_bytes"] / _MB, least["total_bytes"] / _MB
     fix = (

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from lpac.fleet.session import Session
+from lpac.fleet.session import RemoteError, Session
 
 Facts = dict[str, Any]
 
@@ -55,13 +55,23 @@ async def containers(session: Session) -> list[Facts] | None:
 
 
 async def units(session: Session, names: Sequence[str]) -> dict[str, Facts]:
-    """Whether each unit is there, runs, and starts at boot."""
-    services = [name if "." in name else f"{name}.service" for name in names]
-    command = shlex.join(["systemctl", "show", "--no-pager", "-p",
-                          "Id,LoadState,ActiveState,UnitFileState", *services])  # fmt: skip
-    told = units_of((await session.look({"units": command}))["units"])
+    """Whether each unit is there, runs, and starts at boot; none does where systemd is silent."""
+    told = units_of((await session.look({"units": shlex.join(_show(names))}))["units"])
     nowhere = {"there": False, "active": False, "enabled": False}
     return {name: told.get(name.removesuffix(".service"), nowhere) for name in names}
+
+
+async def unit(session: Session, name: str) -> Facts:
+    """The same of one unit. Raises RemoteError where systemd is silent."""
+    for told in units_of(await session.must(*_show([name]))).values():
+        return told
+    raise RemoteError(f"systemd says nothing of unit {name}")
+
+
+def _show(names: Sequence[str]) -> list[str]:
+    services = [name if "." in name else f"{name}.service" for name in names]
+    properties = "Id,LoadState,ActiveState,UnitFileState"
+    return ["systemctl", "show", "--no-pager", "-p", properties, *services]
 
 
 async def ping(session: Session, addresses: Mapping[str, str], count: int) -> dict[str, Facts]:

@@ -22,7 +22,7 @@ async def start(session: Session, config: FleetConfig) -> None:
 
     Raises RemoteError if it is not, or if a file of the release is not what it was when it came.
     """
-    await _require_whole(session, config)
+    await require_whole(session, config)
     await _start(session)
 
 
@@ -31,12 +31,13 @@ async def restart(
 ) -> None:
     """Stop the unit and start it again; as `stop` and `start`."""
     # First what takes time: a vehicle may wait in the air.
-    await _require_whole(session, config)
+    await require_whole(session, config)
     await stop(session, robot, in_flight=in_flight, disable=False)
     await _start(session)
 
 
-async def _require_whole(session: Session, config: FleetConfig) -> None:
+async def require_whole(session: Session, config: FleetConfig) -> None:
+    """Raises RemoteError if a file of the current release is not what it was when it came."""
     current = f"{config.directory}/current/"
     if (await session.run("test", "-e", f"{current}robot.toml")).code != 0:
         raise RemoteError("there is no release for a slot on this robot: deploy first")

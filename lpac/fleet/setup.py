@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple, Self
 from edge.core.schema import ConfigError
 from lpac.fleet.deploy import lpac_inside
 from lpac.fleet.hold import identity_of, other_identity
-from lpac.fleet.probes import VISION_HUB, containers, units, without_comments
-from lpac.fleet.program import hear_heartbeat, require_disarmed, start, stop
+from lpac.fleet.probes import VISION_HUB, containers, unit, without_comments
+from lpac.fleet.program import hear_heartbeat, require_disarmed, require_whole, start, stop
 from lpac.fleet.session import RemoteError, Session
 from lpac.fleet.settings import FleetConfig, RobotHost
 
@@ -79,7 +79,7 @@ async def set_vision_hub(session: Session, robot: RobotHost) -> EnrolStep:
     kept = f"{VISION_HUB}.before-lpac"
     await session.must("sh", "-c", f"[ -e {kept} ] || cp -p {VISION_HUB} {kept}")
     await session.write({VISION_HUB: f"{json.dumps(values | wanted, indent=4)}\n".encode()})
-    if (await _unit(session, _HUB_UNIT))["active"]:
+    if (await unit(session, _HUB_UNIT))["active"]:
         await session.must("systemctl", "restart", _HUB_UNIT)
     else:
         changes.append(f"{_HUB_UNIT} does not run: see `systemctl status {_HUB_UNIT}`")
@@ -105,11 +105,11 @@ async def retire(
         notes.append(f"stopped {kind} {name}")
 
     for name in (*predecessors, _DDS_AGENT):
-        container, unit = by_name.get(name), await _unit(session, name)
+        container, known_unit = by_name.get(name), await unit(session, name)
         if container and (container["running"] or container["restarts"] != "no"):
             update = ("docker", "update", "--restart=no", name)
             await stop_it("container", name, update, ("docker", "stop", name))
-        if unit["active"] or unit["enabled"]:
+        if known_unit["active"] or known_unit["enabled"]:
             await stop_it("unit", name, ("systemctl", "disable", "--now", name))
     stopped = bool(notes)
     notes += [
@@ -121,7 +121,7 @@ async def retire(
     notes += [
         f"unit {name} runs: if it sends setpoints, add it to predecessors"
         for name in _BRIDGES
-        if name not in predecessors and (await _unit(session, name))["active"]
+        if name not in predecessors and (await unit(session, name))["active"]
     ]
     if known is not None:
         return EnrolStep.of("predecessors", stopped, notes)
@@ -149,6 +149,7 @@ async def set_up_px4(
     state = (await session.call("service"))["active"]
     program_runs = state in ("active", "activating", "reloading")
     if program_runs:
+        await require_whole(session, config)
         say("stops the program")
         await stop(session, robot, in_flight=False, disable=False)
     try:
@@ -160,7 +161,7 @@ async def set_up_px4(
         except ValueError:
             raise RemoteError(done.reason.replace("lpac: ", "", 1)) from None
         notes, needs_reboot = [*told["changes"]], told["needs_reboot"]
-        restarts = needs_reboot and (await _unit(session, _PX4))["active"]
+        restarts = needs_reboot and (await unit(session, _PX4))["active"]
         if restarts:
             say("restarts PX4")
             await asyncio.sleep(_PARAMETERS_SAVED_S)
@@ -198,7 +199,3 @@ async def _await_px4(session: Session, robot: RobotHost) -> int | None:
         beat = await hear_heartbeat(session, robot)
         heard = beat["system_id"] if beat else heard
     return heard
-
-
-async def _unit(session: Session, name: str) -> dict[str, bool]:
-    return (await units(session, [name]))[name]

@@ -5,6 +5,7 @@ import asyncio
 import contextlib
 import json
 import stat
+import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,13 @@ def make(folder: Path, files: dict[str, str]) -> None:
     (folder / "manifest.json").write_text(json.dumps({"files": entries}))
 
 
+def make_spare(folder: Path) -> None:
+    """Make the release one without a slot."""
+    for name in ("robot.toml", "link", "manifest.json"):
+        (folder / name).unlink()
+    make(folder, {"world.env": ""})
+
+
 def test_a_release_runs_only_if_every_file_is_what_the_manifest_says(tmp_path: Path) -> None:
     make(tmp_path, {"root/usr/bin/lpac": "run", "robot.toml": "a = 1"})
     agent.check(str(tmp_path))
@@ -83,6 +91,107 @@ def test_a_release_runs_only_if_every_file_is_what_the_manifest_says(tmp_path: P
     refused("link")
     (tmp_path / "manifest.json").write_text('{"files": {}}')
     refused("link")
+    for torn in ("", '{"fil', "{}", "[]", '{"files": 1}'):
+        (tmp_path / "manifest.json").write_text(torn)
+        with pytest.raises(Refused, match=r"^manifest.json is not whole: deploy again$"):
+            agent.check(str(tmp_path))
+
+
+class Systemd:
+    """Systemd as the agent sees it: what was done, and what its program says after a restart."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        self.done: list[str] = []
+        self.armed: Callable[[], bool] = lambda: False
+        self.status: Callable[[], dict[str, Any]] = lambda: {}
+        clock_s = [0.0]
+
+        def run(command: list[str], timeout_s: float = 10.0) -> dict[str, Any]:
+            if command[0] == "ln":
+                Path(command[3]).symlink_to(command[2])
+            elif command[0] == "systemctl":
+                self.done.append(command[1])
+            return {"code": 0, "out": "", "err": ""}
+
+        def service() -> dict[str, Any]:
+            clock_s[0] += 1.0
+            restarts = self.done.count("restart")
+            return {"active": "active", "fresh": True, "restarts": 0, "result": "",
+                    "invocation": restarts, "status": self.status()}  # fmt: skip
+
+        monkeypatch.setattr(agent, "run", run)
+        monkeypatch.setattr(agent, "service", service)
+        monkeypatch.setattr(agent, "armed", lambda _: self.armed())
+        monkeypatch.setattr(agent, "_lock", [0])
+        monkeypatch.setattr(agent, "_UNIT_PATH", f"{folder}/")
+        monkeypatch.setattr(agent, "_sync", lambda *_: None)
+        monkeypatch.setattr(agent, "_send", lambda _: None)
+        monkeypatch.setattr("time.monotonic", lambda: clock_s[0])
+        monkeypatch.setattr("time.sleep", lambda _: None)
+
+    def well(self) -> dict[str, Any]:
+        loops = {"control": {"failures": 0, "ticks": time.monotonic()}}
+        return {"link": True, "boot_nonce": self.done.count("restart"), "loops": loops}
+
+
+@pytest.fixture
+def systemd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Systemd:
+    """Two releases, of which the first runs."""
+    for name in ("1", "2"):
+        make(tmp_path / "opt" / "releases" / name, {"robot.toml": ""})
+    (tmp_path / "opt" / "current").symlink_to("releases/1")
+    (tmp_path / "units").mkdir()
+    found = Systemd(monkeypatch, tmp_path / "units")
+    found.status = found.well
+    return found
+
+
+@pytest.mark.parametrize("spare", [False, True])
+def test_a_vehicle_that_is_armed_during_a_switch_is_not_restarted(
+    systemd: Systemd, tmp_path: Path, spare: bool
+) -> None:
+    folder = tmp_path / "opt"
+    if spare:
+        make_spare(folder / "releases" / "2")
+    systemd.armed = lambda: "daemon-reload" in systemd.done
+    with pytest.raises(Refused, match=r"armed by now: nothing is restarted .* switch is pending"):
+        agent.switch(str(folder), "2", PORT)
+    assert "interrupted; the vehicle is armed by now" in str(agent._recover(str(folder), PORT))
+    assert systemd.done == ["daemon-reload"] and (folder / "pending").exists()
+    systemd.armed = lambda: False
+    assert "was finished: the robot runs" in str(agent._recover(str(folder), PORT))
+    assert agent.linked(str(folder)) == "2" and not (folder / "pending").exists()
+    assert ("disable" if spare else "restart") in systemd.done
+
+
+def test_a_release_that_is_not_whole_is_not_switched_to(systemd: Systemd, tmp_path: Path) -> None:
+    folder = tmp_path / "opt"
+    (folder / "releases" / "2" / "manifest.json").write_text("{")
+    with pytest.raises(Refused, match=r"^manifest.json is not whole: deploy again$"):
+        agent.switch(str(folder), "2", PORT)
+    assert not systemd.done and not (folder / "pending").exists()
+
+
+@pytest.mark.parametrize(
+    "status", [{}, {"link": True}, {"link": True, "boot_nonce": 1, "loops": {"control": {}}}]
+)
+def test_a_program_whose_status_lacks_something_is_taken_back(
+    systemd: Systemd, tmp_path: Path, status: dict[str, Any]
+) -> None:
+    folder = tmp_path / "opt"
+    systemd.status = lambda: status if agent.linked(str(folder)) == "2" else systemd.well()
+    with pytest.raises(Refused, match=r"its status cannot be read: .* the robot runs .* again"):
+        agent.switch(str(folder), "2", PORT)
+    assert agent.linked(str(folder)) == "1" and not (folder / "pending").exists()
+
+
+def test_a_first_release_that_never_became_current_is_taken_back(
+    systemd: Systemd, tmp_path: Path
+) -> None:
+    folder = tmp_path / "opt"
+    (folder / "current").unlink()
+    assert "first release" in agent._take_back(str(folder), None, PORT)
+    assert systemd.done == ["disable"]
 
 
 @given(names=st.sets(st.integers(1, 9), max_size=6), current=st.integers(1, 9))
@@ -134,6 +243,7 @@ def test_the_programs_word_counts_while_it_has_the_vehicle(
 CONFIG = load_fleet(ROOT / "docs" / "fleet.toml")
 R1 = CONFIG.robots["r1"]
 PORT = R1.mavlink_port
+RUNNING = "Id=old.service\nLoadState=loaded\nActiveState=active\nUnitFileState=enabled\n"
 
 
 class Robot(LocalSession):
@@ -144,7 +254,9 @@ class Robot(LocalSession):
         self.changed: list[object] = []
 
     async def run(self, *command: str, timeout_s: float = 60.0) -> Done:
-        if command[0] not in ("cat", "date"):
+        if command[:2] == ("systemctl", "show"):
+            return Done(0, RUNNING, "")
+        if command[0] not in ("cat", "date", "test"):
             self.changed.append(command)
         return Done(0, self.out, "")
 
@@ -152,8 +264,7 @@ class Robot(LocalSession):
         self.changed += files
 
     async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
-        running = "Id=old.service\nLoadState=loaded\nActiveState=active\nUnitFileState=enabled\n"
-        return dict.fromkeys(commands, running)
+        return dict.fromkeys(commands, RUNNING)
 
 
 FOUND: dict[str, Any] = {
@@ -276,9 +387,37 @@ def test_a_container_engine_that_is_silent_keeps_nobody_from_being_enrolled(
         async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
             return dict.fromkeys(commands, "")
 
+    monkeypatch.setattr(f"{__name__}.RUNNING", "Id=old.service\nLoadState=not-found\n")
     step = asyncio.run(setup.retire(Silent(), R1, ["old_stack"], lambda _: None))
     assert step.outcome == "left to do"
     assert "docker does not answer" in step.notes[0]
+    # Systemd could start what is taken for stopped.
+    monkeypatch.setattr(f"{__name__}.RUNNING", "")
+    with pytest.raises(RemoteError, match="systemd says nothing of unit old_stack"):
+        asyncio.run(setup.retire(Silent(), R1, ["old_stack"], lambda _: None))
+
+
+def test_no_release_is_removed_while_the_current_one_is_not_known() -> None:
+    robot, release = Robot(), Release("a", 1, IMAGE, Path(), 1)
+    found = FOUND | {"number": None}
+    with pytest.raises(RemoteError, match="its current release was not read"):
+        asyncio.run(deploy._make_room(robot, CONFIG, release, found, "/opt/lpac/incoming/a"))
+    assert not robot.changed
+
+
+def test_a_program_that_could_not_start_again_is_not_stopped_for_px4(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def damaged(folder: str) -> dict[str, Any]:
+        raise Refused(f"{folder} is not what the release has: deploy again")
+
+    robot = Robot()
+    monkeypatch.setattr(agent, "armed", lambda _: False)
+    monkeypatch.setitem(agent._CALLS, "check", damaged)
+    monkeypatch.setitem(agent._CALLS, "service", lambda: {"active": "active"})
+    with pytest.raises(RemoteError, match="is not what the release has"):
+        asyncio.run(setup.set_up_px4(robot, CONFIG, R1, lambda _: None))
+    assert not robot.changed
 
 
 @pytest.mark.parametrize(("failures", "is_proven"), [(0, True), (1, True), (2, False)])

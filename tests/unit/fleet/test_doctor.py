@@ -273,6 +273,7 @@ def container(**about: object) -> list[dict[str, object]]:
             ]),
             "disk", "warning", "300 of 9000 MB free at /var",
         ),
+        (put("disks", []), "disk", "skipped", "df says nothing"),
         (put("service.status.system_id", 9), "mavlink", "FAILED", "system id 9, configured is 1"),
         (put("service.status.autopilot", False), "mavlink", "FAILED", "the autopilot is silent"),
         (put("wifi", []), "wifi", "skipped", "no wireless interface"),
