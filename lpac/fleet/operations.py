@@ -34,6 +34,8 @@ async def for_each(
             outcome = Outcome(robot, await task(robot), None)
         except (FleetError, ValueError, OSError) as error:
             outcome = Outcome[T](robot, None, " ".join(str(error).split()))
+        except LookupError as error:
+            outcome = Outcome[T](robot, None, f"its answer lacks something: {error!r}")
         on_outcome(outcome)
         return outcome
 

@@ -29,15 +29,16 @@ _STAGE_S = 380.0
 # Modification time and path, of the flight logs and of PX4's; a laptop that has gone an hour ago
 # fetches nothing any more.
 _LIST = f"""find {_PLACE}* -maxdepth 0 -mmin +60 -exec rm -rf {{}} +
-find {_STATE}/logs -name '*.mcap' -printf '%T@ %p\\n'
-find /data/px4/log -path '*/sess*/*.ulg' -printf '%T@ %p\\n'"""
+find {_STATE}/logs -type f -name '*.mcap' -printf '%T@ %p\\n'
+find /data/px4/log -type f -path '*/sess*/*.ulg' -printf '%T@ %p\\n'"""
 # Large files are only linked to, so that nothing of them is copied on the robot; but those that may
-# still grow are, so that what travels is what the checksums are of.
+# still grow are, so that what travels is what the checksums are of. A link that somebody put there
+# may lead anywhere.
 _STAGE = f"""set -e; umask 077; d=$(mktemp -d {_PLACE}XXXXXX); trap 'rm -rf "$d"' EXIT
 put() {{
-    [ -e "$2" ] || return 0
+    [ -f "$2" ] && [ ! -L "$2" ] || return 0
     mkdir -p "$(dirname "$d/$1")"
-    if [ "$(find -L "$2" -mmin -1)" ]; then cp -pL "$2" "$d/$1"
+    if [ "$(find "$2" -type f -mmin -1)" ]; then cp -p "$2" "$d/$1"
     else ln -s "$(realpath "$2")" "$d/$1"; fi
 }}
 """

@@ -49,10 +49,11 @@ _ADVICE = (
     (r"Permission denied", "it refuses the login: run `lpac fleet enroll`, or look at your key"),
     (r"Could not resolve", "its host name is not known"),
     (r"Connection refused", "nothing listens on its ssh port"),
+    # rsync then says that the connection is closed, too.
+    (r"No space left", "its disk is full"),
     (r"No route to host|timed out|Network is unreachable|not responding|Connection closed|"
      r"Connection reset|Broken pipe|connection unexpectedly closed|timeout in data send/receive",
      "it does not answer: it is off, or out of reach"),
-    (r"No space left", "its disk is full"),
     # env quotes the name.
     (r"python3\W?: ((command )?not found|No such)", "python3 is missing on the robot"),
     (r"rsync: (command )?not found", "rsync is missing on the robot"),

@@ -200,7 +200,11 @@ def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
         typer.echo(f"{own} has a new key: start `lpac ground` again")
     authority.renew_group_key()
     bring_list(config)
-    others = {m.name for m in authority.members.members if m.robot_id is None} - {own}
-    for name in sorted(others):
-        typer.echo(f"{name} keeps its key: `lpac fleet operator {name}` makes a new one")
+    for member in sorted(authority.members.members, key=lambda member: member.name):
+        if member.robot_id is None and member.name != own:
+            observer = " --observer" if member.role is Role.OBSERVER else ""
+            typer.echo(
+                f"{member.name} keeps its key: `lpac fleet operator {member.name} --out DIR"
+                f"{observer}` makes a new one"
+            )
     require_all(outcomes, "renewed on")

@@ -71,14 +71,16 @@ def enroll(of: EnrolOptions) -> None:
     if not names:
         raise ValueError(f"{of.fleet}: has no robots yet: give a name and an address")
     left = []
-    for name in names:
-        if len(names) > 1:
-            typer.echo(f"{name}:")
-        if steps := _enroll(name, of):
-            left.append(f"{name} is not ready: left to do: {', '.join(steps)}")
-    config = load_fleet(of.fleet)
-    if config.keys is not None:
-        bring_list(config)
+    try:
+        for name in names:
+            if len(names) > 1:
+                typer.echo(f"{name}:")
+            if steps := _enroll(name, of):
+                left.append(f"{name} is not ready: left to do: {', '.join(steps)}")
+    finally:
+        config = load_fleet(of.fleet)
+        if config.keys is not None:
+            bring_list(config)
     if left:
         raise ValueError("; ".join(left))
     are = "is" if len(names) == 1 else "are"

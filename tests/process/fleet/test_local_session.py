@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lpac.fleet import agent, members, probes, up
+from lpac.fleet import agent, members, probes, pull, up
 from lpac.fleet.authority import create_authority
 from lpac.fleet.settings import load_fleet
 from tests.conftest import ROOT
@@ -33,8 +33,9 @@ def test_starts_that_were_numbered_by_a_clock_far_ahead_are_numbered_anew(
     days: float, ahead: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     now_ms = int(1e3 * time.time())
-    start = tmp_path / "start"
-    start.write_text(f"{now_ms + int(days * 86_400_000)}\n")
+    start, others = tmp_path / "start", tmp_path / "others"
+    others.write_text(f"{now_ms + int(days * 86_400_000)}\n")
+    start.symlink_to(others)
     monkeypatch.setattr(up, "_START", str(start))
     before = start.read_text()
     assert asyncio.run(up.renumber_starts(LocalSession())) is ahead
@@ -42,6 +43,26 @@ def test_starts_that_were_numbered_by_a_clock_far_ahead_are_numbered_anew(
         assert 0 <= int(start.read_text()) - now_ms < 60_000
     else:
         assert start.read_text() == before
+    # The program's user may have put a link there for root to follow.
+    assert others.read_text() == before
+
+
+def test_only_files_are_fetched_and_not_what_links_lead_to(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    state, secret = tmp_path / "state", tmp_path / "secret"
+    (state / "logs").mkdir(parents=True)
+    secret.write_text("root's")
+    (state / "logs" / "1.mcap").write_text("flown")
+    (state / "logs" / "2.mcap").symlink_to(secret)
+    (state / "logs" / "3.mcap").mkdir()
+    listing = pull._LIST.replace(pull._STATE, str(state)).replace(pull._PLACE, f"{tmp_path}/place-")
+    session = LocalSession()
+    listed = asyncio.run(session.run("sh", "-c", listing)).out
+    assert [line.split()[1] for line in listed.splitlines()] == [f"{state}/logs/1.mcap"]
+    stage = pull._STAGE.replace(pull._PLACE, f"{tmp_path}/place-")
+    puts = "".join(f"put {n}.mcap {state}/logs/{n}.mcap\n" for n in (1, 2, 3, 4))
+    assert asyncio.run(session.must("sh", "-c", f'{stage}{puts}ls "$d"')) == "1.mcap\n"
 
 
 def test_a_tool_that_hangs_holds_nothing_up() -> None:

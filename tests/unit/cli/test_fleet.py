@@ -8,10 +8,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from lpac.cli.fleet import membership
 from lpac.cli.fleet.status import State, print_status
 from lpac.cli.main import app
 from lpac.fleet.logs import Entry, parse_entry, readable
 from lpac.fleet.operations import Outcome
+from lpac.fleet.session import UnreachableError
 from lpac.fleet.settings import FleetConfig, load_fleet
 from tests.conftest import ROOT, SHIPPED
 
@@ -61,6 +63,23 @@ def test_an_address_that_others_read_in_another_way_is_refused(
     result = CliRunner().invoke(app, [*command, "--fleet", str(path)])
     assert isinstance(result.exception, ValueError)
     assert named in str(result.exception) and "must be" in str(result.exception)
+
+
+def test_the_list_of_members_is_brought_although_a_robot_is_not_enrolled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    brought: list[str] = []
+
+    def enroll(name: str, _: object) -> list[str]:
+        if name == "r2":
+            raise UnreachableError("r2 does not answer")
+        return []
+
+    monkeypatch.setattr(membership, "_enroll", enroll)
+    monkeypatch.setattr(membership, "bring_list", lambda config: brought.extend(config.robots))
+    result = CliRunner().invoke(app, ["fleet", "enroll", "--fleet", str(EXAMPLE)])
+    assert str(result.exception) == "r2 does not answer"
+    assert brought == list(load_fleet(EXAMPLE).robots)
 
 
 def entry(text: object) -> Entry:

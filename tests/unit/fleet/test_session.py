@@ -27,12 +27,29 @@ from tests.conftest import ROOT
         ("env: \u2018python3\u2019: No such file or directory", "python3 is missing"),
         ("sh: 1: python3: not found", "python3 is missing"),
         ("bash: line 1: rsync: command not found", "rsync is missing"),
+        (
+            'rsync: [receiver] write failed on "/opt/lpac/x": No space left on device (28)\n'
+            "rsync: connection unexpectedly closed (37 bytes received so far) [sender]",
+            "its disk is full",
+        ),
+        ("rsync: connection unexpectedly closed (0 bytes received so far)", "it does not answer"),
         ("this and\n that\n", "that"),
         ("", "it does not answer any more"),
     ],
 )
 def test_last_words_mean_something(words: str, meaning: str) -> None:
     assert meaning in explain(words, "r1.field")
+
+
+def test_an_answer_that_lacks_something_is_one_robots_outcome() -> None:
+    robots = list(load_fleet(ROOT / "docs" / "fleet.toml").robots.values())[:2]
+
+    async def task(robot: RobotHost) -> int:
+        return {robots[1].name: 1}[robot.name]
+
+    first, second = asyncio.run(for_each(robots, task))
+    assert first.problem == f"its answer lacks something: KeyError('{robots[0].name}')"
+    assert second.value == 1
 
 
 def test_every_robot_is_left_in_order_however_long_that_takes() -> None:

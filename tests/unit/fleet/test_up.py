@@ -17,8 +17,8 @@ class Robot:
     async def look(self, _: object) -> dict[str, str]:
         return {"start": "1800000000000", "now": "1700000000000"}
 
-    async def must(self, *_: str) -> str:
-        return ""
+    async def write(self, *_: object) -> None:
+        """Nothing is kept."""
 
     async def call(self, _: str) -> dict[str, Any]:
         return {"enabled": True, "active": "active"}
