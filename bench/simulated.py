@@ -44,7 +44,7 @@ def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Result:
             Target(
                 f"{robots} whole robots: times real time",
                 median["real_time_factor"],
-                5.0,
+                10.0,
                 at_least=True,
             )
         ],
