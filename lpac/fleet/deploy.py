@@ -54,7 +54,6 @@ async def deploy(
     """
     async with hold(config, robot, report) as held:
         before, session = held.found, held.session
-        await bring_members(session, config)
         if before["machine"] != release.image.machine:
             raise RemoteError(
                 f"it is {before['machine']}, and the image is for {release.image.machine}: "
@@ -66,9 +65,11 @@ async def deploy(
         if before["current"] == release.id and before["pending"] is None and runs:
             report("check", None)
             if await _is_whole(session, f"{config.directory}/current/"):
+                await bring_members(session, config)
                 return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
         incoming = f"{config.directory}/incoming/{release.id}"
         kept = await _make_room(session, config, release, before, incoming)
+        await bring_members(session, config)
         like = [f"--link-dest={config.directory}/releases/{name}" for name in kept]
         sent_bytes = await _send(config, robot, release, held, incoming, like, report)
         steps = await _prove(session, release, incoming, report)

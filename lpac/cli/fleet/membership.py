@@ -71,6 +71,7 @@ def enroll(of: EnrolOptions) -> None:
     if not names:
         raise ValueError(f"{of.fleet}: has no robots yet: give a name and an address")
     left = []
+    before = _members(of.fleet)
     try:
         for name in names:
             if len(names) > 1:
@@ -78,9 +79,8 @@ def enroll(of: EnrolOptions) -> None:
             if steps := _enroll(name, of):
                 left.append(f"{name} is not ready: left to do: {', '.join(steps)}")
     finally:
-        config = load_fleet(of.fleet)
-        if config.keys is not None:
-            bring_list(config)
+        if _members(of.fleet) != before:
+            bring_list(load_fleet(of.fleet))
     if left:
         raise ValueError("; ".join(left))
     are = "is" if len(names) == 1 else "are"
@@ -88,6 +88,15 @@ def enroll(of: EnrolOptions) -> None:
         f"{', '.join(names)} {are} enrolled; `lpac fleet doctor --robots {','.join(names)}` looks "
         "at the rest"
     )
+
+
+def _members(fleet: Path) -> bytes | None:
+    """This computer's list of members, None without one."""
+    from edge.drivers.identity_folder import MEMBERS
+    from lpac.fleet.settings import load_fleet
+
+    keys = load_fleet(fleet).keys
+    return None if keys is None or not (keys / MEMBERS).exists() else (keys / MEMBERS).read_bytes()
 
 
 def _enroll(name: str, of: EnrolOptions) -> list[str]:
