@@ -65,10 +65,12 @@ def test_an_address_that_others_read_in_another_way_is_refused(
     assert named in str(result.exception) and "must be" in str(result.exception)
 
 
-def test_the_list_of_members_is_brought_although_a_robot_is_not_enrolled(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("changed", [True, False])
+def test_a_changed_list_of_members_is_brought_although_a_robot_is_not_enrolled(
+    monkeypatch: pytest.MonkeyPatch, changed: bool
 ) -> None:
     brought: list[str] = []
+    lists = iter([b"before", b"after" if changed else b"before"])
 
     def enroll(name: str, _: object) -> list[str]:
         if name == "r2":
@@ -76,10 +78,11 @@ def test_the_list_of_members_is_brought_although_a_robot_is_not_enrolled(
         return []
 
     monkeypatch.setattr(membership, "_enroll", enroll)
+    monkeypatch.setattr(membership, "_members", lambda _: next(lists))
     monkeypatch.setattr(membership, "bring_list", lambda config: brought.extend(config.robots))
     result = CliRunner().invoke(app, ["fleet", "enroll", "--fleet", str(EXAMPLE)])
     assert str(result.exception) == "r2 does not answer"
-    assert brought == list(load_fleet(EXAMPLE).robots)
+    assert brought == (list(load_fleet(EXAMPLE).robots) if changed else [])
 
 
 def entry(text: object) -> Entry:
