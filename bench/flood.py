@@ -5,7 +5,8 @@ import json
 import multiprocessing
 import tempfile
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -14,7 +15,8 @@ import zenoh
 
 from bench import BUNDLE
 from bench.result import Result, Table, Target, progress
-from edge.drivers.identity_folder import load_identity
+from edge.drivers.identity_folder import listening_identity
+from edge.messages.topics import TlsFiles
 from lpac.sim.engines import require_flown
 from lpac.sim.fleet.flight import FleetMoment, fly_programs
 from lpac.sim.fleet.processes import Fleet
@@ -92,19 +94,11 @@ def _flood(
     over: Event,
     sent: "Synchronized[int]",
 ) -> None:
-    """A program that speaks zenoh and keeps to no rule, with the keys in that folder."""
-    config = zenoh.Config()
-    for key, value in {
-        "mode": "peer",
-        "scouting/multicast/enabled": False,
-        "connect/endpoints": endpoints,
-        "listen/endpoints": [f"{'tcp' if keys is None else 'tls'}/127.0.0.1:0"],
-        **({} if keys is None else {"transport/link/tls": _certified(keys, fleet)}),
-    }.items():
-        config.insert_json5(key, json.dumps(value))
+    """Publish `RATE_HZ` messages a second until `over`, with the keys in that folder, if any."""
+    tls = None if keys is None else certified(listening_identity(keys, fleet=fleet).tls)
     names = itertools.cycle(_OUTSIDERS if keys is None else _MEMBERS)
     began_s, count = time.monotonic(), 0
-    with zenoh.open(config) as session:
+    with unruly_session(endpoints, tls) as session:
         while not over.wait(_STEP_S):
             due = int((time.monotonic() - began_s) * RATE_HZ)
             for name in itertools.islice(names, due - count):
@@ -112,8 +106,30 @@ def _flood(
             count = sent.value = due
 
 
-def _certified(keys: Path, fleet: str) -> dict[str, object]:
-    files = load_identity(keys, fleet=fleet, unix_s=time.time()).tls
+@contextmanager
+def unruly_session(
+    endpoints: Sequence[str], tls: Mapping[str, object] | None, mode: str = "peer"
+) -> Iterator[zenoh.Session]:
+    """Open a zenoh session on the robots' radio, without our link's checks and limits.
+
+    `tls` is zenoh's own setting, such as that of `certified`; without it the session speaks TCP.
+    """
+    scheme = "tcp" if tls is None else "tls"
+    config = zenoh.Config()
+    for key, value in {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "listen/endpoints": [f"{scheme}/127.0.0.1:0"],
+        "connect/endpoints": [e.replace("tls/", f"{scheme}/") for e in endpoints],
+        **({} if tls is None else {"transport/link/tls": tls}),
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as opened:
+        yield opened
+
+
+def certified(files: TlsFiles) -> dict[str, object]:
+    """Return zenoh's TLS setting with a member's certificate."""
     return {
         "root_ca_certificate": files.authority, "enable_mtls": True,
         "verify_name_on_connect": False,

@@ -183,14 +183,15 @@ class Guard(ABC):
         """Payload and sender of a message that came on that key."""
 
     def _receive(self, topic: Topic, hear: Hear, key: str, data: bytes) -> bool:
-        if topic.sender == "robot" and robot_id_in(key) is None:
+        robot_id = robot_id_in(key)
+        if topic.sender == "robot" and robot_id is None:
             self._refuse(RefusedMessage.NOT_ALLOWED, key)
             return False
         envelope = read_envelope(data)
         found: tuple[bytes, Speaker] | RefusedMessage = RefusedMessage.NO_ENVELOPE
         if envelope is not None:
             found = self._opened(topic, key, envelope)
-        elif (robot_id := robot_id_in(key)) is not None and is_of_other_version(data):
+        elif robot_id is not None and is_of_other_version(data):
             # Nobody knows whether that robot sent it.
             with self._lock:
                 self._strangers.add(robot_id)

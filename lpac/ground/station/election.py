@@ -1,7 +1,7 @@
-"""Who commands: of several ground stations one, whose name is the `operator` of the state that the
-robots obey. The others observe.
+"""Leader election among ground stations: one commands, and the others observe.
 
-What robots say of whom they obey counts if most of them say so: one alone may be cut off, or lie.
+The commander is the `operator` named in the state that the robots obey. A robot's report of whom it
+obeys counts only if most robots agree: one alone may be cut off, or lie.
 """
 
 import math

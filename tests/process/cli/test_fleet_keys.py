@@ -1,4 +1,4 @@
-"""Who belongs to a fleet, as its operator says it on the command line."""
+"""Membership commands of `lpac fleet`, as an operator types them."""
 
 import json
 import stat

@@ -592,7 +592,7 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
             return [seen["present"] for seen in near.seen() + far.seen()]
 
         def others(*teams: tuple[int, ...]) -> list[list[int]]:
-            """Whom each robot hears if only the robots of its own team hear each other."""
+            """Robots received by each, if only robots of one team receive each other."""
             return [[other for other in team if other != robot] for team in teams for robot in team]
 
         all_pairs = list(permutations(nearby + far_away, 2))

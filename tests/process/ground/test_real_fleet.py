@@ -338,7 +338,7 @@ def test_a_lossy_link_and_then_a_new_ground_in_flight(fleet: Fleet, tmp_path: Pa
 
 
 def test_a_ground_that_dies_while_robots_take_off(fleet: Fleet) -> None:
-    """Who is in the air holds, and lands after a while; nobody else takes off."""
+    """Robots in the air hold, and land after a while; no other takes off."""
     with run_ground(fleet) as ground:
         ground.make_ready()
         asked = threading.Thread(target=ask_until_it_dies, args=(ground, Takeoff(interval_s=60.0)))

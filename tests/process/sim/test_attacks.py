@@ -1,15 +1,14 @@
-"""Who may not fly the fleet does not: real programs and real radio, judged by the vehicles' truth.
+"""Unauthorised senders do not fly the fleet: real programs and radio, judged by true positions.
 
 Two robots and their ground fly with keys of their own; whoever attacks has what an outsider has,
 or another fleet's keys, or those of a stolen robot.
 """
 
-import json
 import secrets
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -18,6 +17,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from bench.flood import certified, unruly_session
 from edge.drivers.identity_folder import Identity, load_identity
 from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.guard import SignedGuard
@@ -25,7 +25,7 @@ from edge.identity.members import Role
 from edge.messages.codec import encode
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, GroundState, Order, RobotStatus
-from edge.messages.topics import HOLD, ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
+from edge.messages.topics import HOLD, ORDER, STATE, STATUS, TOPICS, Topic
 from lpac.fleet.authority import Authority, create_authority, new_member
 from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
@@ -63,34 +63,6 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetRig]:
         rig.take_off()
         rig.start()
         yield rig
-
-
-@contextmanager
-def session(
-    fleet: Fleet, tls: Mapping[str, object] | None, mode: str = "peer"
-) -> Iterator[zenoh.Session]:
-    """A session on the robots' radio that keeps to no rule."""
-    scheme = "tcp" if tls is None else "tls"
-    config = zenoh.Config()
-    for key, value in {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "listen/endpoints": [f"{scheme}/127.0.0.1:0"],
-        "connect/endpoints": [e.replace("tls/", f"{scheme}/") for e in fleet.endpoints],
-        **({} if tls is None else {"transport/link/tls": tls}),
-    }.items():
-        config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as opened:
-        yield opened
-
-
-def certified(files: TlsFiles) -> dict[str, object]:
-    return {
-        "root_ca_certificate": files.authority, "enable_mtls": True,
-        "verify_name_on_connect": False,
-        "listen_private_key": files.key, "listen_certificate": files.certificate,
-        "connect_private_key": files.key, "connect_certificate": files.certificate,
-    }  # fmt: skip
 
 
 def attack(rig: FleetRig, session: zenoh.Session, seal: Callable[[Topic, bytes], bytes]) -> None:
@@ -162,7 +134,10 @@ def test_without_a_key_nobody_gets_in(rig: FleetRig, nothing_comes_of: Repeated)
         "listen_private_key": str(keys / "key.pem"),
         "listen_certificate": str(keys / "certificate.pem"),
     }  # fmt: skip
-    with session(rig.fleet, None) as plain, session(rig.fleet, one_sided) as nameless:
+    with (
+        unruly_session(rig.fleet.endpoints, None) as plain,
+        unruly_session(rig.fleet.endpoints, one_sided) as nameless,
+    ):
 
         def once() -> None:
             for opened in (plain, nameless):
@@ -186,7 +161,7 @@ def test_another_fleet_of_the_same_name_does_not_meet_this_one(
             tls=other.tls,
             subscriptions={STATUS: lambda *_: heard.set()},
         ) as link,
-        session(rig.fleet, certified(other.tls)) as opened,
+        unruly_session(rig.fleet.endpoints, certified(other.tls)) as opened,
     ):
         guard = SignedGuard(other.membership, lambda: 0.0)
         nothing_comes_of(lambda: attack(rig, opened, guard.seal))
@@ -204,7 +179,7 @@ def test_a_stolen_robots_key_commands_nobody(
     guard = SignedGuard(stolen.membership, lambda: 0.0)
     recorded: dict[str, bytes] = {}
     prefix = f"lpac/{rig.fleet.name}/"
-    with session(rig.fleet, certified(stolen.tls), mode) as opened:
+    with unruly_session(rig.fleet.endpoints, certified(stolen.tls), mode) as opened:
         for topic in TOPICS:
             opened.declare_subscriber(
                 prefix + topic.pattern,
@@ -285,7 +260,7 @@ def test_a_landing_and_a_kill_act_after_any_single_forged_message(
 
 
 def begin_again(rig: FleetRig) -> None:
-    """Who was killed in offboard needs a pilot's mode, and a new start of its program."""
+    """Recover a robot killed in offboard: a pilot's mode, and a new start of its program."""
     for robot in ROBOTS:
         with rig.simulated.stepped:
             rig.vehicle(robot).set_mode(Px4Mode.HOLD)
@@ -310,7 +285,7 @@ def thief(rig: FleetRig) -> Iterator[Callable[[int], None]]:
     stolen = stolen_identity(rig)
     guard = SignedGuard(stolen.membership, lambda: 0.0)
     prefix = f"lpac/{rig.fleet.name}/"
-    with session(rig.fleet, certified(stolen.tls)) as opened:
+    with unruly_session(rig.fleet.endpoints, certified(stolen.tls)) as opened:
 
         def says(which: int) -> None:
             status = rig.status(0)
@@ -344,7 +319,7 @@ def test_a_flood_of_a_laptop_drowns_no_command(
     new_member(authority, tmp_path, role, "eve")
     eve = load_identity(tmp_path, fleet=rig.fleet.name, unix_s=1.0)
     over = threading.Event()
-    with session(rig.fleet, certified(eve.tls)) as opened:
+    with unruly_session(rig.fleet.endpoints, certified(eve.tls)) as opened:
 
         def flood() -> None:
             # The vehicles are simulated in this process, too.

@@ -148,7 +148,7 @@ class SeenFlight:
 
 
 def missions(snapshot: FleetSnapshot) -> list[str]:
-    """Who flies the mission."""
+    """Robots that fly the mission."""
     return [r.name for r in snapshot.robots if r.status and r.status.state is _S.MISSION]
 
 

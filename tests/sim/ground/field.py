@@ -184,7 +184,7 @@ class Field:
         return [robot.state for robot in self.robots]
 
     def operators(self) -> set[str]:
-        """Whom the robots obey."""
+        """Operators that the robots obey."""
         return {robot.said.operator for robot in self.robots}
 
     def land(self) -> None:

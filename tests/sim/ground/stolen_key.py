@@ -72,7 +72,7 @@ class Harm:
 
 @dataclass(frozen=True, slots=True)
 class HeldUp:
-    """Who is kept on the ground, or from the mission, while the thief lies, and once it is revoked.
+    """Robots kept from takeoff or mission while the thief lies, and once it is revoked.
 
     Each counts robots.
     """
@@ -171,7 +171,7 @@ def harms(
 
 
 def held_up(ready: SimulatedFleet, hovering: SimulatedFleet, seed: int) -> HeldUp:
-    """Who takes off, and who flies the mission, beside a thief that says that it takes off."""
+    """Count robots that do not take off, or start, beside a thief that claims to take off."""
     counts = []
     for before, request, state in (
         (ready, Takeoff(interval_s=0.0), FlightState.HOLD),

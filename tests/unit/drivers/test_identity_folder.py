@@ -8,7 +8,8 @@ import pytest
 
 from edge.core.schema import ConfigError
 from edge.drivers import identity_folder
-from edge.drivers.identity_folder import GROUP_KEYS, MEMBERS, load_identity
+from edge.drivers.identity_folder import GROUP_KEYS, MEMBERS, Identity, load_identity
+from edge.identity.guard import SignedGuard
 from edge.identity.members import Members, Role
 from lpac.fleet.authority import (
     Authority,
@@ -46,15 +47,21 @@ def test_a_member_is_who_the_authority_says(authority: Authority, tmp_path: Path
         load_identity(folder, fleet="demo", unix_s=2e9)
 
 
-def test_a_running_program_takes_up_the_list_that_it_is_brought(
-    authority: Authority, tmp_path: Path
-) -> None:
+def brought_a_new_list(authority: Authority, tmp_path: Path) -> tuple[Identity, SignedGuard]:
+    """A robot's running program, in whose folder a newer list was just put."""
     folder = tmp_path / "r3"
     new_member(authority, folder, Role.ROBOT, "r3", 3)
     identity = load_identity(folder, fleet="demo", unix_s=2e9)
     guard = identity.guard(lambda: 0.0)
     new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
     give_list(authority, folder)
+    return identity, guard
+
+
+def test_a_running_program_takes_up_the_list_that_it_is_brought(
+    authority: Authority, tmp_path: Path
+) -> None:
+    identity, guard = brought_a_new_list(authority, tmp_path)
     identity.take_up(guard)
     assert guard.members == authority.members
 
@@ -104,12 +111,7 @@ def test_a_list_that_cannot_be_used_changes_nothing_and_is_told_once(
 def test_a_list_that_could_not_be_read_once_is_read_again(
     authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = tmp_path / "r3"
-    new_member(authority, folder, Role.ROBOT, "r3", 3)
-    identity = load_identity(folder, fleet="demo", unix_s=2e9)
-    guard = identity.guard(lambda: 0.0)
-    new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
-    give_list(authority, folder)
+    identity, guard = brought_a_new_list(authority, tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(identity_folder, "read_members", _too_many_open_files)
         identity.take_up(guard)

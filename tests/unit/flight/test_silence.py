@@ -1,4 +1,4 @@
-"""Who fell silent in flight: where it may be, and until when."""
+"""Robots that fell silent in flight: where they may be, and until when."""
 
 import math
 from dataclasses import replace
