@@ -189,7 +189,7 @@ def decode(
         return Rejection.PAYLOAD_LENGTH
     size = _size(message_size, payload_type, shared_side)
     if kind & _COMPRESSED:
-        unpacked = _unpacked(body, size)
+        unpacked = inflate(body, size)
         if unpacked is None:
             return Rejection.COMPRESSION
         body = unpacked
@@ -221,15 +221,19 @@ def _size(length: int, payload_type: PayloadType, shared_side: int) -> int:
     return size + length * _FLOATS[payload_type].itemsize
 
 
-def _unpacked(body: memoryview, size: int) -> memoryview | None:
-    """Decompress a body; None if it is not one whole stream."""
-    inflate = zlib.decompressobj(wbits=-zlib.MAX_WBITS)
+def deflate(data: bytes) -> bytes:
+    """Compress data to one raw deflate stream (RFC 1951)."""
+    return zlib.compress(data, _EFFORT, -zlib.MAX_WBITS)
+
+
+def inflate(data: bytes | memoryview, size: int) -> memoryview | None:
+    """Decompress one whole raw deflate stream, but at most `size` + 1 bytes; None if it is none."""
+    stream = zlib.decompressobj(wbits=-zlib.MAX_WBITS)
     try:
-        # One byte too many tells that there are more: nobody makes a robot unpack them.
-        unpacked = memoryview(inflate.decompress(body, size + 1))
+        unpacked = memoryview(stream.decompress(data, size + 1))
     except zlib.error:
         return None
-    if inflate.unused_data or not (inflate.eof or len(unpacked) > size):
+    if stream.unused_data or not (stream.eof or len(unpacked) > size):
         return None
     return unpacked
 

@@ -15,6 +15,7 @@ from threading import Lock
 from msgspec import Struct
 
 from edge.core.logger import log
+from edge.core.wire import deflate, inflate
 from edge.identity.envelope import (
     NO_MEMBERS,
     RELEASE,
@@ -69,6 +70,7 @@ class RefusedMessage(StrEnum):
     FORGED = "forged"
     REPLAYED = "replayed"
     START_AHEAD = "start_ahead"
+    COMPRESSION = "compression"
 
 
 @dataclass(slots=True)
@@ -195,6 +197,13 @@ class Guard(ABC):
             # Nobody knows whether that robot sent it.
             with self._lock:
                 self._strangers.add(robot_id)
+        if not isinstance(found, RefusedMessage) and topic.deflated:
+            payload = inflate(found[0], topic.limit_bytes)
+            found = (
+                RefusedMessage.COMPRESSION
+                if payload is None or len(payload) > topic.limit_bytes
+                else (bytes(payload), found[1])
+            )
         if isinstance(found, RefusedMessage):
             self._refuse(found, key)
             return False
@@ -228,7 +237,7 @@ class Unguarded(Guard):
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """See `Guard`."""
         number = MessageNumber(self._start, self._next_sequence(topic.pattern))
-        return enclose(payload, number, release=self.release)
+        return enclose(_packed(topic, payload), number, release=self.release)
 
     def _opened(
         self, topic: Topic, key: str, envelope: Envelope
@@ -364,7 +373,7 @@ class SignedGuard(Guard):
 
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """See `Guard`."""
-        return self._seal(_key(self._own, topic), payload)
+        return self._seal(_key(self._own, topic), _packed(topic, payload))
 
     def _seal(self, key: str, payload: bytes) -> bytes:
         return seal(
@@ -446,6 +455,10 @@ class _SealingLink:
     def refused(self) -> int:
         """How many messages it did not look at."""
         return self._link.refused()
+
+
+def _packed(topic: Topic, payload: bytes) -> bytes:
+    return deflate(payload) if topic.deflated else payload
 
 
 def _knock_key(sender: Member, place: str) -> str:

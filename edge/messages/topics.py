@@ -20,11 +20,12 @@ Priority = Literal["now", "later"]
 class Topic(NamedTuple):
     """One kind of message.
 
-    `content` names what its bytes are, `rate_hz` is how often one sender says it (a state less
-    often to a large fleet: see `state_hz`), `most_hz` how often a key is listened to at most, and
+    `content` names what its bytes are, `rate_hz` is how often one sender says it, `most_hz` how
+    often a key is listened to at most, and
     `most_of_one_hz` of that one connection, if several speak on the key; `limit_bytes` is the
     largest that is listened to, `logged` the flight log's topic that holds what came or went.
-    Of what is sent at once, "later" goes when nothing else waits.
+    Of what is sent at once, "later" goes when nothing else waits. A `deflated` payload travels as a
+    raw deflate stream, of at most `limit_bytes` when unpacked.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Topic(NamedTuple):
     priority: Priority
     logged: str | None
     most_of_one_hz: float | None = None
+    deflated: bool = True
 
     @property
     def pattern(self) -> str:
@@ -44,27 +46,21 @@ class Topic(NamedTuple):
 
 
 # A policy may be run faster than the paper's, and a ground orders each robot of a fleet at once.
-MESSAGE = Topic("message", "robot", "Beacon, AggregatedMessage", 2.5, 100, 2**20, "now", "received")
+MESSAGE = Topic(
+    "message", "robot", "Beacon, AggregatedMessage", 2.5, 100, 2**20, "now", "received",
+    deflated=False,  # `edge.core.wire` compresses what is worth it.
+)  # fmt: skip
 STATUS = Topic("status", "robot", "RobotStatus", 2.0, 20, 2**16, "now", "status")
 EXPLORED = Topic("explored", "robot", "bits", 1.0, 5, 2**10, "later", None)
 # Of ten grounds, so that one that floods, such as a revoked laptop, drowns no other's hold. What is
 # said within such a time of the last is not heard, which is why an order has none: those for all
 # robots of a fleet go at once.
-STATE = Topic("state", "ground", "GroundState", 5.0, 500, 2**16, "now", "ground", 50)
-HOLD = Topic("hold", "ground", "Hold", 5.0, 500, 2**14, "now", None, 50)
+STATE = Topic("state", "ground", "GroundState", 2.5, 500, 2**16, "now", "ground", 50)
+HOLD = Topic("hold", "ground", "Hold", 2.5, 500, 2**14, "now", None, 50)
 ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")
 WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 50, 400_000, "later", None, 5)
 
 TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, HOLD, ORDER, WORLD)
-
-# By TCP a state goes to each robot by itself: so many of them a second are enough for a fleet, but
-# each robot needs some before it takes the ground for lost.
-_STATES_HZ, _LEAST_STATE_HZ = 250.0, 2.0
-
-
-def state_hz(robots: float) -> float:
-    """How often a ground says its `STATE` to so many robots, if nothing changes."""
-    return min(STATE.rate_hz, max(_LEAST_STATE_HZ, _STATES_HZ / robots))
 
 
 def robot_id_in(key: str) -> int | None:

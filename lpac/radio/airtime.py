@@ -30,7 +30,7 @@ from edge.core.schema import AtLeastOne, Bounded, NonNegative, Positive, require
 from edge.core.wire import PayloadType
 from edge.identity.envelope import HEAD_BYTES
 from edge.identity.group import DATAGRAM_BYTES, PART_BYTES, frames
-from edge.messages.topics import EXPLORED, MESSAGE, STATUS, state_hz
+from edge.messages.topics import EXPLORED, MESSAGE, STATE, STATUS
 
 # How robots' messages travel, in fleets as in the model.
 Transport = Literal["mesh", "multicast"]
@@ -65,23 +65,17 @@ _SEGMENTS_PER_ACK = 2.0
 MESSAGE_BYTES: Mapping[PayloadType, float] = MappingProxyType(
     {"float32": 2576.0, "float16": 1786.0, "int8": 1206.0}
 )
-EXPLORED_BYTES = 605.0
+EXPLORED_BYTES = 150.0
 
 
 def status_bytes(robots: float) -> float:
-    """The mean of the RobotStatuses of one that hears all of so many.
-
-    It names each of them twice, and in one of four three times.
-    """
-    return 2738.0 + 26.0 * robots
+    """Mean size of the RobotStatuses of a robot that hears all of so many."""
+    return 1110.0 + 10.0 * robots
 
 
 def state_bytes(robots: float) -> float:
-    """Of a GroundState for so many.
-
-    It has an echo for each whose status is 0.3 s old at most, which are six of ten; for 32 at most.
-    """
-    return 503.0 + min(42.0 * robots, 70.0 * 32.0)
+    """Size of a GroundState for so many, with an echo of each, but of 32 at most."""
+    return 342.0 + 24.0 * min(robots, 32.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -410,7 +404,7 @@ def _flows(traffic: Traffic, robots: int) -> tuple[_Flow, ...]:
         _Flow("message", "robot", robots, hz, size, others),
         _Flow("status", "robot", robots, traffic.status_hz, status_bytes(robots), 0.0, True),
         _Flow("explored", "robot", robots, EXPLORED.rate_hz, EXPLORED_BYTES, 0.0, True),
-        _Flow("state", "ground", 1.0, state_hz(robots), state_bytes(robots), robots),
+        _Flow("state", "ground", 1.0, STATE.rate_hz, state_bytes(robots), robots),
     )
 
 

@@ -5,8 +5,8 @@ import math
 from edge.messages.mission import Echo
 from lpac.ground.station.heard import HeardRobots
 
-# Each status is echoed once or twice, but in large fleets: clocks need no more.
-_ECHOED_S, _MOST_ECHOES = 0.3, 32
+# Each status is echoed once or twice, less often in large fleets: clocks need no more.
+_ECHOED_S, _MOST_ECHOES = 0.5, 32
 
 
 class Echoes:

@@ -18,14 +18,14 @@ from lpac.ground.station.orders import Orders
 from lpac.ground.station.places import places_of
 from lpac.ground.station.wishes import changes_in_words, is_safer, rank
 
-# Before it says anything, a station listens: who commands, whom do the robots obey?
+# Listening time before a new station commands; a state is published every 0.4 s.
 LISTEN_S = 0.7
 # A commander is gone also if robots say so, who hear what this station may not.
 _ROBOTS_HEAR_NOBODY_S = 1.0
 _OVERTAKEN_S = 1.0
-# Robots that heard this station's name a moment ago have heard another one of that name. They hear
-# a state five times a second, and say so twice a second; one of either may be lost.
-_SPOKE_S = 1.2
+# Robots that heard this station's name more recently have heard another station of that name: a
+# state comes every 0.4 s, a status every 0.5 s, and one of either may be lost.
+_SPOKE_S = 1.4
 _NAME_TAKEN_S = 3.0
 _NAME_SHARED_S = 10.0
 # Beyond what most robots obey, none has heard a station.
@@ -122,8 +122,20 @@ class Election:
         return self.state
 
     def remember(self, state: GroundState) -> None:
-        """Take the last process's state: it counts if robots still obey just that."""
+        """Take the state that this computer published last: it counts if robots still obey it."""
         self._remembered = state
+
+    def _is_obeyed_still(self) -> bool:
+        """Whether most of the fleet obeys the state that this computer published last.
+
+        Any other commander's state would have a greater sequence.
+        """
+        if self._remembered is None:
+            return False
+        known = rank(self._remembered)
+        statuses = self._robots.statuses().values()
+        obeying = sum((s.obeyed_sequence, s.operator) == known for s in statuses)
+        return 2 * obeying > len(self._setup.robots)
 
     def _known_state(self) -> GroundState:
         """State of the fleet: as last heard, remembered, or seen in the robots."""
@@ -196,17 +208,19 @@ class Election:
             return
         if self._obeyed_since_s is None:
             self._obeyed_since_s = self._robots.now_s
+        # The robots' ages tell of a commander that this station does not hear, but they do.
+        alone = self.commander_age_s > _ROBOTS_HEAR_NOBODY_S
+        most_tell = 2 * len(self._robots.statuses()) > len(self._setup.robots)
+        resumes = self._is_obeyed_still()
         listened_s = self._robots.now_s - self._obeyed_since_s
-        if listened_s < LISTEN_S:
+        if listened_s < LISTEN_S and not (resumes or (alone and most_tell)):
             return
-        if self._own_name_age_s() < _SPOKE_S:
+        if not resumes and self._own_name_age_s() < _SPOKE_S:
             if listened_s > _NAME_TAKEN_S:
                 self._tell_shared_name()
                 self._decided = True
             return
         self._decided = True
-        # The robots' ages tell of a commander that this station does not hear, but they do.
-        alone = self.commander_age_s > _ROBOTS_HEAR_NOBODY_S
         if self.may_command and (alone or self.commander == self._setup.operator):
             self.take_command()
 

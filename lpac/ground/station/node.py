@@ -27,7 +27,6 @@ from edge.messages.topics import (
     Link,
     ReceiveCallback,
     Topic,
-    state_hz,
 )
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot
 from lpac.ground.station.commands import Commands, CommandTask
@@ -214,7 +213,7 @@ class GroundNode:
         self._published = self._to_publish()
         if self._link is None:
             return
-        due = now_s - self._state_at_s > 1.0 / state_hz(len(station.setup.robots)) - _EARLY_S
+        due = now_s - self._state_at_s > 1.0 / STATE.rate_hz - _EARLY_S
         if due or self._published != before:
             state, hold = station.published_state(), station.published_hold
             if state is not None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from edge.core.wire import inflate
 from edge.identity.envelope import HEAD_BYTES
 from edge.identity.guard import Unguarded
 from edge.messages.codec import decode, encode
@@ -31,7 +32,9 @@ class Ground:
 
     def publish(self, topic: Topic, data: bytes) -> None:
         if topic == STATE:
-            self.said.append((self.now_s, decode(GroundState, data[HEAD_BYTES:])))
+            payload = inflate(data[HEAD_BYTES:], topic.limit_bytes)
+            assert payload is not None
+            self.said.append((self.now_s, decode(GroundState, bytes(payload))))
 
     def is_claimed(self, _: int) -> bool:
         return False
@@ -72,10 +75,10 @@ def flown(robots: int, duration_s: float) -> tuple[Ground, GroundNode]:
     return ground, node
 
 
-@pytest.mark.parametrize(("robots", "states_hz"), [(10, 5.0), (50, 5.0), (100, 2.5), (300, 2.0)])
-def test_states_are_said_less_often_to_more(robots: int, states_hz: float) -> None:
+@pytest.mark.parametrize("robots", [10, 300])
+def test_states_are_said_as_often_as_the_table_of_topics_says(robots: int) -> None:
     ground, _ = flown(robots, 10.0)
-    assert len(ground.said) / 10.0 == pytest.approx(states_hz, rel=0.1)
+    assert len(ground.said) / 10.0 == pytest.approx(STATE.rate_hz, rel=0.1)
 
 
 @pytest.mark.parametrize("robots", [32, 100])
