@@ -7,7 +7,7 @@ _INSTALLED = Path(__file__).parent / "_shipped"
 
 
 def shipped(name: str) -> Path:
-    """Where a shipped file lies, by its path in the repository."""
+    """Path of a shipped file, from its path in the repository."""
     root = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1]
     return root / name
 

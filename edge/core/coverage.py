@@ -136,7 +136,7 @@ def _blocks(importance: F32, positions: F64) -> Iterator[_Block]:
 
 
 def _may_own(dx2: F64, dy2: F64) -> npt.NDArray[np.bool_]:
-    """Which of k robots can be nearest to a point of a rectangle, (k,).
+    """Mask of the k robots that can be nearest to some point of a rectangle, (k,).
 
     `dx2` and `dy2`, (k, 2) each, are the parts of the squared distances to its sides. The
     difference of two robots' squared distances is linear in the point, so a robot that is farther

@@ -118,7 +118,7 @@ def rounded(payload: F32, payload_type: PayloadType) -> F32:
 
 
 def payload_type_of(data: bytes) -> PayloadType:
-    """That of a message which `decode` accepts."""
+    """Payload type of a message that `decode` accepts."""
     return _CODES[data[0] & ~(_WITH_MAP | _COMPRESSED)]
 
 

@@ -66,7 +66,7 @@ def allow_most_descriptors() -> None:
 
 
 def descriptors_short() -> str:
-    """That this program has nearly as many files and connections open as it may; "" if not."""
+    """Warning that nearly all file descriptors of this process are in use; "" if not."""
     used = sum(1 for _ in Path("/proc/self/fd").iterdir())
     most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return f"{used} of {most} descriptors are in use" if used > _MOST_USED * most else ""

@@ -1,4 +1,4 @@
-"""That a program is to end, as a signal says it to the main thread."""
+"""Request to end the program, passed from a signal handler to the main thread."""
 
 import os
 import select

@@ -37,7 +37,7 @@ _Check = Callable[[Tick], Refusal | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderRule:
-    """Where one kind of order is accepted, and its effects in addition to its transition.
+    """States that accept one kind of order, and its effects besides the transition.
 
     Each check gives a reason of refusal, or None: `first` in any state, `checks` where it is
     accepted. `from_anybody`: independent of the commander and of earlier orders. `moves_nothing`:

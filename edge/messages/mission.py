@@ -67,7 +67,7 @@ _NO_REASON = Reason(ReasonCode.OTHER, "")
 
 
 class FlightState(StrEnum):
-    """Where a robot is in its flight; `flight.transitions` tells what leads where."""
+    """State of a robot's flight; `flight.transitions` lists the transitions."""
 
     INIT = "init"
     IDLE = "idle"
@@ -96,7 +96,7 @@ OrderKind = Literal["takeoff", "start", "pilot", "rejoin", "reset", "disarm", "k
 
 @dataclass(frozen=True, slots=True)
 class Origin(Bounded):
-    """Where the mission frame lies, as the operator sets it: degrees, heading in [0, 360).
+    """Origin of the mission frame, set by the operator: degrees, heading in [0, 360).
 
     Raises ValueError if a number is out of its range.
     """

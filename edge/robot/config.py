@@ -59,7 +59,7 @@ _LoopRate = Annotated[float, Meta(ge=0.1, le=100.0)]
 
 
 def require_url(key: str, url: str) -> None:
-    """Where PX4's datagrams come in."""
+    """Raise ValueError unless `url` is udpin://ADDRESS:PORT, where PX4's datagrams arrive."""
     match = re.fullmatch(r"udpin://([^:/]+):([0-9]{1,5})", url)
     if match is None:
         raise ValueError(f"{key} = {url!r}: must be udpin://ADDRESS:PORT")
@@ -172,7 +172,7 @@ class LinkConfig:
 
 @dataclass(frozen=True, slots=True)
 class IdentityConfig:
-    """Where `lpac fleet enroll` put who this robot is; "": it is no member of a fleet."""
+    """Folder with the identity that `lpac fleet enroll` wrote; "": not a member of a fleet."""
 
     folder: str = ""
 

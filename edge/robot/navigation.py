@@ -90,7 +90,7 @@ class Navigation:
         )
 
     def place_in(self, frame: MissionFrame, vehicle: VehicleState) -> tuple[float, float] | None:
-        """Where the robot is in that frame, (x, y), m; None when lost or too old."""
+        """Position of the robot in `frame`, (x, y), m; None when lost or too old."""
         origin, position_m = vehicle.origin, vehicle.position_local_m
         if origin is None or position_m is None or not self._is_known(vehicle):
             return None

@@ -39,7 +39,7 @@ class ReceivedMessage(NamedTuple):
 
 @dataclass(slots=True)
 class _Robot:
-    """What is known of one robot: its newest beacon, and its policy's newest message."""
+    """One robot's newest beacon, and its policy's newest message."""
 
     number: Number
     heard: HeardBeacon

@@ -182,7 +182,7 @@ class Pac:
         self.table.clear()
 
     def beacon(self, now_s: float) -> Beacon:
-        """What precedes a message that is sent now, as far as it is known here."""
+        """Beacon that precedes a message sent now, with the fields known to this robot."""
         odometry = self._finite_odometry()
         return Beacon(
             robot_id=self._robot_id,

@@ -40,7 +40,7 @@ _OUT = Path("out/drill")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrillOptions:
-    """What is flown, how, and where it goes."""
+    """Options of `lpac drill`: flights, engine, output."""
 
     vehicle: Annotated[
         Literal["simulated", "mavlink", "px4"],

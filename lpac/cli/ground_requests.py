@@ -114,7 +114,7 @@ def looking(to: Addressed) -> Iterator["GroundSubscriber"]:
 def measure(
     subscriber: "GroundSubscriber", robots: Sequence[str], seconds: float
 ) -> dict[str, "Standing"]:
-    """Where these robots stand, averaged. Raises ValueError, one line, if one cannot tell."""
+    """Average the robots' positions and headings. Raises ValueError, one line, if one has none."""
     from lpac.ground.procedure import gather
     from lpac.ground.site import standing
     from lpac.ground.station.subscriber import addressed

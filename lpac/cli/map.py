@@ -20,7 +20,7 @@ app = new_app()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOptions:
-    """Where the page is served, and what it may do."""
+    """Options of `lpac map`: address, and whether the page may command."""
 
     fleet: Fleet = DEFAULT_FLEET
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = (

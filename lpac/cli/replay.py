@@ -85,7 +85,7 @@ def _run_again(logs: list[Path], bundle: Path | None) -> _RunAgain:
 
 
 def _print_well(of: _RunAgain) -> None:
-    """That nothing differs."""
+    """Print that nothing differs."""
     if of.bundle is not None:
         found = "computes what it computed in flight"
         if not of.comparisons:

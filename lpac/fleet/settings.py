@@ -164,8 +164,7 @@ class RobotHost:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where a robot finds bundle and world and who it is, keeps its logs, and the address it
-    listens on."""
+    """A robot's paths (bundle, world, identity, logs), and the address it listens on."""
 
     bundle: str
     world: str
@@ -208,12 +207,12 @@ class FleetConfig:
     radio: RadioConfig = field(default_factory=RadioConfig)
 
     def endpoint(self, robot: RobotHost) -> str:
-        """Where zenoh reaches the robot."""
+        """Zenoh endpoint of the robot."""
         return f"{self.scheme}/{robot.address}:{robot.zenoh_port}"
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """Where zenoh reaches the robots."""
+        """Zenoh endpoints of the robots."""
         return tuple(map(self.endpoint, self.robots.values()))
 
     @property

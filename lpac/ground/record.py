@@ -228,7 +228,7 @@ async def _follow(
 
 
 def _line(snapshot: FleetSnapshot, cost: Cost | None) -> str:
-    """Where things stand."""
+    """Status line of the recorder."""
     heard = sum(robot.fresh for robot in snapshot.robots)
     words = [
         time.strftime("%H:%M:%S", time.localtime(snapshot.unix_time_s)),

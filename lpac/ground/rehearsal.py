@@ -72,5 +72,5 @@ def carried(status: RobotStatus, configured: Fence) -> Carried:
 
 
 def _eighth(angle_deg: float) -> int:
-    """Which of eight directions, clockwise, the angle is nearest to."""
+    """Index of the nearest of eight directions, clockwise."""
     return round(angle_deg / 45.0) % 8

@@ -52,7 +52,7 @@ class CircularMean(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """Where a robot stands: (latitude, longitude), and its nose's heading, None if not known.
+    """Averaged position of a robot, (latitude, longitude), and its heading, None if unknown.
 
     The spreads are those of the statuses that were furthest from the average.
     """
@@ -101,7 +101,7 @@ def bearing_deg(from_deg: Point, to_deg: Point) -> float:
 
 
 def standing(robot: str, statuses: Sequence[RobotStatus]) -> Standing:
-    """Where a robot stands, from what it said of itself while it was listened to.
+    """Average the position and heading that a robot's statuses report.
 
     Raises ValueError, one line, if it was not heard, is armed, does not know its position, or
     moves.
@@ -286,7 +286,7 @@ def assign_places(
 
 
 def places_at(site: "SavedSite", setup: FleetSetup, robots: Iterable[str]) -> dict[str, Place]:
-    """Where these robots fly and land at the site: each in the slot with the height that it has.
+    """Places of these robots at the site: each takes the slot with its present height.
 
     Raises ValueError for a robot that sits in no slot, or in one that the site does not have, or if
     the places are too close to each other.

@@ -87,7 +87,7 @@ class Radio:
                 link.suspended_until_s = self.schedule.monotonic_s() + duration_s
 
     def leave(self, link: "RadioLink") -> None:
-        """That one is gone."""
+        """Remove a link."""
         self._links.remove(link)
 
     def others(self, link: "RadioLink") -> frozenset[int]:

@@ -47,10 +47,10 @@ _FRONTIER_PITCH = 8
 
 
 class Baseline(Protocol):
-    """Where robots at `positions` (N, 2), in model units, should go next."""
+    """Controller that gives each robot its next goal."""
 
     def goals(self, positions: F64) -> F64:
-        """Sense at `positions`, then decide."""
+        """Sense at `positions` (N, 2), in model units; return the goals, (N, 2)."""
 
 
 class ClairvoyantCvt:

@@ -77,7 +77,7 @@ class PointVehicles:
 
 
 class VehicleOdometry:
-    """Where one vehicle is, as its robot is told (an OdometrySource)."""
+    """OdometrySource of one vehicle, with the position error that its robot receives."""
 
     def __init__(self, vehicles: PointVehicles, robot: int, bias_m: F64 | None = None) -> None:
         """`bias_m` (2,) is by how much what it is told of its position is wrong, all the time."""

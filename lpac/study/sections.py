@@ -26,7 +26,7 @@ _SNAPSHOTS_S = (0.0, 0.25, 0.5, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """What a report tells of flights.
+    """Section of a report on flights.
 
     `data` is for scripts, `rows` are the CSV's, its heading first.
     """

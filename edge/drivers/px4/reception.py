@@ -1,4 +1,4 @@
-"""Which of a vehicle's MAVLink frames are taken, and what became of the others; no socket or clock.
+"""Filter and counters of a vehicle's MAVLink frames: duplicates, late, lost. No socket, no clock.
 
 A router, or a second path, may bring frames twice, late or out of order: one that was taken before,
 or is older than the newest, is not taken. MAVLink numbers the frames of a link by one byte, so what

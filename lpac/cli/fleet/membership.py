@@ -27,7 +27,7 @@ _STEP_WIDTH = 14
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnrolOptions:
-    """Which computer, and what it becomes."""
+    """Arguments of `lpac fleet enroll`: the computer, and its robot's name and id."""
 
     name: Annotated[
         str | None,

@@ -83,7 +83,7 @@ def _named(of: Named, command: str) -> Addressed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OriginOptions:
-    """Where the mission frame lies."""
+    """Origin of the mission frame."""
 
     latitude: Annotated[float | None, typer.Argument(metavar="LAT", help="Degrees.")] = None
     longitude: Annotated[float | None, typer.Argument(metavar="LON", help="Degrees.")] = None

@@ -1,4 +1,4 @@
-"""Where the live map is reached, and who may see it and act through it: rules about headers.
+"""Access to the live map: address, token, and checks of request headers.
 
 Any page that the operator's browser shows can send requests to this machine. So what comes must
 name this very server (a name of somebody else's that leads here, DNS rebinding, does not), and must

@@ -175,7 +175,7 @@ class Curve:
 
 
 class Paths:
-    """Where robots flew in this mission."""
+    """The robots' paths in this mission."""
 
     def __init__(self) -> None:
         self._paths: dict[str, deque[tuple[float, float]]] = {}

@@ -31,7 +31,7 @@ class GroundError(OSError):
 
 
 def socket_path(fleet: str) -> Path:
-    """Where the fleet's ground process listens: for this user alone.
+    """Path of the socket on which the fleet's ground process listens, for this user alone.
 
     Raises GroundError if the folder could be somebody else's.
     """

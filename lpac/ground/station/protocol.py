@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class SetOrigin:
-    """Where the mission frame lies. Refused while one of the robots is armed."""
+    """Set the origin of the mission frame. Refused while one of the robots is armed."""
 
     origin: Origin
     robots: tuple[str, ...] = ()
@@ -47,7 +47,7 @@ class SetOrigin:
 
 @dataclass(frozen=True, slots=True)
 class SetFence:
-    """Where robots may fly; None: each robot's configured fence. Refused while one is armed."""
+    """Set the fence; None: each robot's configured fence. Refused while one is armed."""
 
     fence: Fence | None
     robots: tuple[str, ...] = ()

@@ -89,7 +89,7 @@ class Station:
 
     @property
     def state(self) -> GroundState | None:
-        """What the fleet is told, by whoever commands; None: nothing yet."""
+        """State that the commander publishes; None: nothing yet."""
         return self.election.state
 
     @property

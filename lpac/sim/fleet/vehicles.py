@@ -15,7 +15,7 @@ from lpac.sim.px4.vehicle import Px4Vehicle, Truth
 
 
 class AutopilotAddress(NamedTuple):
-    """Where a robot's program reaches its vehicle, as MAVSDK has it, and the vehicle's id."""
+    """MAVSDK address at which a robot's program reaches its vehicle, and the vehicle's id."""
 
     url: str
     system_id: int

@@ -151,7 +151,7 @@ class Rack:
         raise NoHostsError("robot hosts find no private network that is free on this machine")
 
     def _cgroups(self) -> list[Path]:
-        """Where systemd's control groups are: one hierarchy, or two on older systems."""
+        """Paths of systemd's control groups: one hierarchy, or two on older systems."""
         hierarchies = [
             path for path in (_CGROUPS / "systemd", _CGROUPS / "unified") if path.exists()
         ]

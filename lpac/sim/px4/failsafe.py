@@ -1,4 +1,4 @@
-"""Which failsafe of several acts, and when."""
+"""Choice of the failsafe that acts, and when."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Where the simulated world lies on the earth, and polygons on it."""
+"""Position of the simulated world on the earth, and polygons on it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from edge.core.frames import m_per_deg
 
 
 class WorldOrigin(NamedTuple):
-    """Where the world frame lies: WGS84 degrees, and the ground's height above mean sea level."""
+    """Origin of the world frame: WGS84 degrees, and the ground's height above mean sea level."""
 
     latitude_deg: float = 39.9526
     longitude_deg: float = -75.1652
@@ -36,7 +36,7 @@ class WorldOrigin(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FencePolygon:
-    """Where the vehicle must stay (or must not go): (latitude, longitude) in deg, in order.
+    """Inclusion or exclusion polygon of PX4's geofence: (latitude, longitude) in deg, in order.
 
     Each is its own: to compare their corners fifty times a second costs more than all else here.
     """
