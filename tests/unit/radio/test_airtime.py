@@ -290,7 +290,9 @@ def heard(robots: int) -> float:
     rng, ids = random.Random(robots), [str(robot) for robot in range(robots)]
     ages_s = {robot: rng.randrange(400) / 1e3 for robot in ids}
     messages = {robot: rng.randrange(1200, 1300) for robot in ids}
-    arrivals = {robot: (1234, 0, rng.randrange(1100, 1200), rng.randrange(99)) for robot in ids}
+    arrivals: dict[str, tuple[int, ...]] = {
+        robot: (1234, 0, rng.randrange(1100, 1200), rng.randrange(99)) for robot in ids
+    }
     counts = RadioCounts(1234, 2_000_000, arrivals)
     status = snapshots.status(0, neighbour_ages_s=ages_s, neighbour_messages=messages)
     return (3 * sealed(status) + sealed(replace(status, radio_counts=counts))) / 4
