@@ -33,7 +33,7 @@ _CODE_BLOCK = re.compile(r"^(`{3,}|~{3,}).*?^\1", re.S | re.M)
 _LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\])\(([^()\s]+)\)")
 _STYLE = "site.css"
 # Copied without change.
-_COPIED = (".png", ".svg", ".html")
+_COPIED = (".png", ".svg")
 # Code would bury the pages in search results.
 _UNSEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"
 

@@ -1,4 +1,4 @@
-"""`python -m handbook.scaling`: draw docs/scaling.png, print the tables of docs/scaling.md."""
+"""`python -m handbook.scaling`: draw docs/scaling.png, print the tables of docs/network.md."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from lpac.radio.airtime import (
     link_quality,
 )
 
-FLEETS = (5, 10, 15, 20, 30, 60, 100)
+FLEETS = (10, 15, 20, 30, 60, 100)
 PAYLOADS: tuple[PayloadType, ...] = ("float16", "int8")
 MOST = 0.6
 
@@ -43,7 +43,7 @@ TOPOLOGIES = (
 
 
 def tables() -> dict[str, str]:
-    """The tables of docs/scaling.md as Markdown, by topic."""
+    """The model's tables of docs/network.md as Markdown, by topic."""
     robots = [str(n) for n in FLEETS]
     return {
         "airtime": _table(
@@ -53,7 +53,7 @@ def tables() -> dict[str, str]:
                 for row, topology in zip(_of_fleets(_percent_of), TOPOLOGIES, strict=True)
             ],
         ),
-        "quality": _table(("lost, mean delay", *robots), _of_fleets(_quality_of)),
+        "quality": _table(("lost, %; mean delay, ms", *robots), _of_fleets(_quality_of)),
     }
 
 
@@ -110,8 +110,8 @@ def _quality_of(topology: Topology, robots: int, payload: PayloadType) -> str:
     traffic = _traffic(robots, payload)
     quality = link_quality(topology.transport, topology.wifi, traffic)
     if quality.loss > 0.95:
-        return "> 95 %"
-    return f"{100.0 * quality.loss:.0f} %, {1e3 * quality.delay_s:.0f} ms"
+        return "> 95"
+    return f"{100.0 * quality.loss:.0f}; {1e3 * quality.delay_s:.0f}"
 
 
 def _carried(topology: Topology, payload: PayloadType) -> str:

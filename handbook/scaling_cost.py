@@ -1,6 +1,6 @@
 """`python -m handbook.scaling_cost FOLDER...`: coverage cost over team size, by transport.
 
-Prints a table of docs/scaling.md from evaluations with `--transport`.
+Prints a table of docs/network.md from evaluations with `--transport`.
 """
 
 import json

@@ -1,6 +1,6 @@
 """How much of a Wi-Fi channel's time a fleet's messages take, and what becomes of them.
 
-A model, not a measurement; docs/scaling.md has its figures, and what emulated Wi-Fi said to it. All
+A model, not a measurement; docs/network.md has its figures, and what emulated Wi-Fi said to it. All
 stations hear each other, on one channel, and around one access point:
 
 - `mesh`: each robot has a TLS connection to each other station. A message crosses the air twice for
@@ -88,7 +88,7 @@ class Wifi(Bounded):
     `queue_s` is how long something waits in queues that are full. `ground_wired`: the ground is at
     the access point's wire; else it is one more station.
 
-    The values that stand here are what docs/scaling.md assumes.
+    The values that stand here are what docs/network.md assumes.
 
     Raises ValueError that names an impossible value.
     """

@@ -56,7 +56,7 @@ class Checked(NamedTuple):
 
     @property
     def expected_loss(self) -> float:
-        """Of a message, by a radio that is as docs/scaling.md assumes."""
+        """Of a message, by a radio that is as docs/network.md assumes."""
         traffic = self.traffic
         if traffic is None:
             return 0.0

@@ -20,7 +20,7 @@ _CHANCE_DEVIATIONS = 3.0
 MOST_LATE = 0.01
 # Of a check's fifty messages, one lost or late is chance.
 _BY_CHANCE = 1
-# Share of a channel's time, with gaps, above which delays grow quickly (docs/scaling.md).
+# Share of a channel's time, with gaps, above which delays grow quickly (docs/network.md).
 MOST_BUSY = 0.6
 # Largest ratio of the radios' counts to the model's that is attributed to this fleet.
 _MODEL_ERR = 1.5

@@ -285,7 +285,7 @@ def _print_verdict(heard: _Heard) -> None:
 def _basis(checked: "Checked", room: "Room") -> str:
     """Describe the assumptions behind the room for more."""
     text = (
-        f"room by the model of docs/scaling.md: {checked.transport} at {_rates(checked, room)}; "
+        f"room by the model of docs/network.md: {checked.transport} at {_rates(checked, room)}; "
         f"{room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a second take "
         f"{100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} bytes in "
         f"flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay below 60 %"

@@ -152,7 +152,7 @@ def test_what_is_assumed_and_comes_from_the_model_is_called_so(
     result = ask((1, 2, 3), radio)
     assert result.exception is None, result.exception
     assert "carries 3 robots; by the model there is room for " in result.stdout
-    assert f"room by the model of docs/scaling.md: {rates}" in result.stdout
+    assert f"room by the model of docs/network.md: {rates}" in result.stdout
 
 
 def test_who_is_not_heard_has_no_figures_and_there_is_no_room_to_tell_of(ask: Ask) -> None:

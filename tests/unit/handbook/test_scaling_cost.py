@@ -1,4 +1,4 @@
-"""Coverage cost over team size, by transport, in docs/scaling.md."""
+"""Coverage cost over team size, by transport, in docs/network.md."""
 
 from typing import Any
 

@@ -123,7 +123,7 @@ def test_a_slow_rate_has_less_room() -> None:
 def test_a_channel_that_is_too_small_for_these_robots_is_a_problem() -> None:
     slow = verdict(checked(wifi=wifi(rate_mbit_s=6.0)), heard())
     assert slow.problems == (
-        "by the model these 10 robots need 232 % of the channel in flight, of which they can "
+        "by the model these 10 robots need 214 % of the channel in flight, of which they can "
         "use 60 %: it carries 5",
     )
     assert slow.sentence == slow.problems[0]
@@ -195,8 +195,8 @@ def test_a_weak_signal_is_told_of_who_is_heard_badly() -> None:
 def test_a_channel_that_others_take() -> None:
     (problem,) = verdict(checked(wifi=wifi(busy_share=0.31)), heard()).problems
     assert problem == (
-        "by the model these 10 robots need 33 % of the channel in flight, of which they can use "
-        "32 %: it carries 9; other networks take 28 %: look for another channel"
+        "by the model these 10 robots need 31 % of the channel in flight, of which they can use "
+        "30 %: it carries 9; other networks take 30 %: look for another channel"
     )
     # Smaller foreign traffic leaves room for some.
     alone, beside = (verdict(checked(wifi=wifi(busy_share=busy)), heard()) for busy in (None, 0.25))
