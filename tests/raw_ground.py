@@ -28,7 +28,7 @@ class RawGround:
     def __init__(self, fleet: str, connect: Sequence[str], heard: FleetListener) -> None:
         self._heard = heard
         self._radio = ZenohLink(fleet=fleet, listen=("tcp/127.0.0.1:0",), connect=connect)
-        self._link: Link = Unguarded(int(1e3 * time.time())).over(self._radio)
+        self._link: Link = Unguarded(int(1e3 * time.time())).wrap(self._radio)
 
     def __enter__(self) -> Self:
         return self

@@ -71,7 +71,7 @@ class Identity:
         stamps = tuple(_stamp(self.folder / name) for name in (MEMBERS, GROUP_KEYS))
         if stamps != self._stamps:
             self._stamps = stamps
-            self._take(lambda: guard.take(read_members(self.folder)))
+            self._take(lambda: guard.update_members(read_members(self.folder)))
             self._take(self._take_keys)
         if self.group_keys is not None and self._given_keys:
             self.group_keys = _followed(self.group_keys, self._given_keys, in_flight=in_flight)

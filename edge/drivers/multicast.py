@@ -26,7 +26,7 @@ from edge.identity.group import (
     datagrams,
     open_datagram,
 )
-from edge.identity.news import NOTHING
+from edge.identity.replay_window import NO_NUMBER
 from edge.messages.admission import Admission
 from edge.messages.topics import MESSAGE, Group, GroupKeys, ReceiveCallback, Topic
 
@@ -178,7 +178,7 @@ class MulticastLink:
 
     def _take(self, fragment: Fragment, now_s: float) -> None:
         # Of an envelope of another version only the sender is known.
-        is_known = fragment.number != NOTHING
+        is_known = fragment.number != NO_NUMBER
         message = self._assembly.add(fragment, now_s, time.time()) if is_known else fragment.head
         if message is None or self._on_message is None:
             return
@@ -193,7 +193,7 @@ class MulticastLink:
             self._failed("callback", error)
             return
         if is_theirs is not False:
-            self._assembly.heard(fragment, now_s)
+            self._assembly.confirm(fragment, now_s)
 
     def _is_own(self, fragment: Fragment) -> bool:
         """Whether it comes back, or a stranger says it again, even from before this program began.

@@ -41,7 +41,7 @@ from edge.messages.topics import (
     TOPICS,
     Knocking,
     ReceiveCallback,
-    Sender,
+    SenderKind,
     TlsFiles,
     Topic,
 )
@@ -111,7 +111,7 @@ class ZenohLink:
         Raises LinkError if a setting is wrong, or a port is taken.
         """
         _check(fleet, robot_id, listen, connect, tls)
-        own: Sender = "ground" if robot_id is None else "robot"
+        own: SenderKind = "ground" if robot_id is None else "robot"
         self._prefix = f"lpac/{fleet}/"
         self._own_prefix = self._prefix + (f"{own}/" if robot_id is None else f"{own}/{robot_id}/")
         self._robot_id = robot_id

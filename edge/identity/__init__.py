@@ -1,1 +1,1 @@
-"""Identity on the radio: members, signed envelopes, and refusal of what is not a member's."""
+"""Identity on the radio: members, signed envelopes, and refusal of all other messages."""

@@ -1,20 +1,20 @@
-"""Envelope of every message: its sender, and in a fleet with keys the sender's signature.
+"""Envelope of every message: the sender, and in a fleet with keys the sender's signature.
 
-Little-endian, 29 bytes before the payload, and the signature behind it:
+Little-endian: 29 bytes before the payload, and the signature after it.
 
 | offset | type | field |
 | --- | --- | --- |
 | 0 | 2 bytes | magic, `LE` |
-| 2 | uint8 | version of this layout, and of the beacon's behind it, 2 |
+| 2 | uint8 | version of this layout and the beacon's, 2 |
 | 3 | 4 bytes | the sender's release |
 | 7 | 4 bytes | digest of the sender's list of members; zeros in a fleet without keys |
-| 11 | 8 bytes | the sender's key, by its fingerprint; zeros in a fleet without keys |
-| 19 | uint48 | the start of its program: each is greater than the last |
+| 11 | 8 bytes | fingerprint of the sender's key; zeros in a fleet without keys |
+| 19 | uint48 | start of the sender's program: each is greater than the last |
 | 25 | uint32 | sequence: one more than the last of that start on this topic |
 | 29 | | the payload |
-| -64 | 64 bytes | Ed25519 signature; nothing in a fleet without keys |
+| -64 | 64 bytes | Ed25519 signature; absent in a fleet without keys |
 
-The signature is over the fleet's authority and the key expression too, so that no message passes
+The signature also covers the fleet's authority and the key expression, so that no message passes
 for one of another fleet, topic or sender.
 """
 
@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 from msgspec import Struct
 
-from edge.identity.news import MessageNumber
+from edge.identity.replay_window import MessageNumber
 from edge.identity.signature import FINGERPRINT_BYTES, SIGNATURE_BYTES, Signer, is_signed
 
 DIGEST_BYTES = 4
@@ -70,7 +70,7 @@ class Head(Struct, frozen=True):
 
 
 class Envelope(Struct, frozen=True):
-    """A message as it came; whether its sender said so is for `is_from` to tell."""
+    """A message as received: `is_from` verifies its sender."""
 
     head: Head
     data: bytes
@@ -81,7 +81,7 @@ class Envelope(Struct, frozen=True):
         return self.data[HEAD_BYTES : -SIGNATURE_BYTES if self.head.is_signed else None]
 
     def is_from(self, public_key: bytes, address: Address) -> bool:
-        """Whether the key's owner said just that there."""
+        """Whether the key's owner signed this message for that address."""
         sealed, signature = self.data[:-SIGNATURE_BYTES], self.data[-SIGNATURE_BYTES:]
         return is_signed(address.signed_text(sealed), signature, public_key)
 
@@ -95,13 +95,13 @@ def seal(
     members: bytes = NO_MEMBERS,
     release: bytes = RELEASE,
 ) -> bytes:
-    """The payload in its signed envelope."""
+    """The payload in a signed envelope."""
     sealed = _head(release, members, signer.fingerprint, number) + payload
     return sealed + signer.sign(address.signed_text(sealed))
 
 
 def enclose(payload: bytes, number: MessageNumber, *, release: bytes = RELEASE) -> bytes:
-    """The payload in the envelope of a fleet without keys."""
+    """The payload in the unsigned envelope of a fleet without keys."""
     return _head(release, NO_MEMBERS, _NO_KEY, number) + payload
 
 
@@ -122,7 +122,7 @@ def read_head(data: bytes) -> Head | None:
 
 
 def is_of_other_version(data: bytes) -> bool:
-    """Whether it is an envelope of a layout that is not known here."""
+    """Whether `data` is an envelope of another version of this layout."""
     return data.startswith(_MAGIC) and data[len(_MAGIC) : len(_MAGIC) + 1] != bytes((_VERSION,))
 
 

@@ -1,7 +1,7 @@
-"""Messages to all robots at once: one datagram, or up to three, sealed with the fleet's group key.
+"""Multicast messages: one to three datagrams each, encrypted with the fleet's group key.
 
-Who is not a member reads none of it, and nothing of his is listened to. Who said it is for the
-envelope inside to tell (`edge.identity.envelope`): any member has the key.
+The group key keeps non-members out. Each robot has it, so the sender is authenticated by the
+envelope inside (`edge.identity.envelope`).
 
 A datagram, little-endian:
 
@@ -9,20 +9,20 @@ A datagram, little-endian:
 | --- | --- | --- |
 | 0 | 2 bytes | magic, `LG` |
 | 2 | uint8 | version of this layout, 3 |
-| 3 | 4 bytes | the key, by its fingerprint |
+| 3 | 4 bytes | fingerprint of the key |
 | 7 | 24 bytes | nonce, random |
 | 31 | 16 bytes | Poly1305 authentication tag |
-| 47 | | a fragment, encrypted by XSalsa20 |
+| 47 | | a fragment, encrypted with XSalsa20 |
 
 A fragment:
 
 | offset | type | field |
 | --- | --- | --- |
 | 0 | uint16 | the sender's robot id |
-| 2 | uint8 | which fragment of the message, from 0 |
-| 3 | uint8 | how many it has |
-| 4 | 29 bytes | head of the message's envelope: the same in each of its fragments |
-| 33 | | its part of what is behind that |
+| 2 | uint8 | index of the fragment, from 0 |
+| 3 | uint8 | count of the message's fragments |
+| 4 | 29 bytes | head of the message's envelope: the same in each fragment |
+| 33 | | part of the remaining envelope |
 """
 
 import hashlib
@@ -43,11 +43,11 @@ from nacl.bindings import (
 from nacl.exceptions import CryptoError
 
 from edge.identity.envelope import HEAD_BYTES, is_of_other_version, read_head
-from edge.identity.news import NOTHING, MessageNumber, Newest
+from edge.identity.replay_window import NO_NUMBER, MessageNumber, ReplayWindow
 
 KEY_BYTES: int = crypto_secretbox_KEYBYTES
 MOST_FRAGMENTS = 3
-# What fits into one frame of 1500 bytes, behind the headers of IPv4 and UDP.
+# A frame of 1500 bytes, less the headers of IPv4 and UDP.
 DATAGRAM_BYTES = 1472
 
 _MAGIC, _VERSION = b"LG", 3
@@ -56,61 +56,58 @@ _HEAD = struct.Struct(f"<2sB{_FINGERPRINT_BYTES}s{crypto_secretbox_NONCEBYTES}s"
 _FRAGMENT = struct.Struct(f"<HBB{HEAD_BYTES}s")
 PART_BYTES = DATAGRAM_BYTES - _HEAD.size - _TAG_BYTES - _FRAGMENT.size
 MOST_BYTES = HEAD_BYTES + MOST_FRAGMENTS * PART_BYTES
-# A sender's fragments come one after another; a fourth message in pieces means that one is lost.
+# Fragments arrive one after another: with a fourth incomplete message, one has lost a fragment.
 _MOST_PARTIAL = 3
-# Each robot of the largest fleet with certificates, and some.
+# More than the robots of the largest fleet with certificates.
 _MOST_SENDERS = 300
 
 
 class GroupKey(NamedTuple):
-    """A key that all robots of a fleet have, and what it is called."""
+    """A key that all robots of a fleet have, and its fingerprint."""
 
     secret: bytes
     fingerprint: bytes
 
     @classmethod
     def of(cls, secret: bytes) -> "GroupKey":
-        """Raises ValueError if it is not 32 bytes."""
+        """The key with this secret. Raises ValueError if it is not 32 bytes."""
         if len(secret) != KEY_BYTES:
             raise ValueError(f"a group key has {len(secret)} bytes: must be {KEY_BYTES}")
         return cls(secret, hashlib.sha256(b"lpac group\0" + secret).digest()[:_FINGERPRINT_BYTES])
 
 
-def key_of_open_fleet(fleet: str) -> bytes:
-    """Group key of a fleet without keys: it keeps fleets apart, and nothing secret."""
+def open_fleet_key(fleet: str) -> bytes:
+    """Group key of a fleet without keys: not secret, it only separates fleets."""
     return hashlib.sha256(f"lpac open fleet {fleet}".encode()).digest()
 
 
 class Fragment(NamedTuple):
-    """A part of a message, as a member sent it; `key` is the place of its key among those known."""
+    """A part of a message from a member; `key` is the index of its key among those known."""
 
     key: int
     sender: int
-    place: int
-    of: int
+    part_index: int
+    part_count: int
     head: bytes
     number: MessageNumber
     part: bytes
 
 
 def frames(message_bytes: float) -> int:
-    """How many datagrams a message of so many bytes takes; more than three are not sent."""
+    """Number of datagrams that a message of that size takes; more than three are not sent."""
     return max(1, math.ceil((message_bytes - HEAD_BYTES) / PART_BYTES))
 
 
 def datagrams(message: bytes, *, sender: int, key: GroupKey) -> list[bytes]:
-    """The message, which has an envelope, in datagrams.
-
-    Raises ValueError for one that takes more than three.
-    """
+    """Datagrams of a message in its envelope. Raises ValueError if it takes more than three."""
     count = frames(len(message))
     if count > MOST_FRAGMENTS:
         raise ValueError(f"a message of {len(message)} bytes: a group takes {MOST_BYTES} at most")
     envelope_head = message[:HEAD_BYTES]
     sealed = []
-    for place in range(count):
-        at = HEAD_BYTES + place * PART_BYTES
-        fragment = _FRAGMENT.pack(sender, place, count, envelope_head)
+    for index in range(count):
+        at = HEAD_BYTES + index * PART_BYTES
+        fragment = _FRAGMENT.pack(sender, index, count, envelope_head)
         nonce = randombytes(crypto_secretbox_NONCEBYTES)
         head = _HEAD.pack(_MAGIC, _VERSION, key.fingerprint, nonce)
         part = message[at : at + PART_BYTES]
@@ -119,7 +116,7 @@ def datagrams(message: bytes, *, sender: int, key: GroupKey) -> list[bytes]:
 
 
 def open_datagram(data: bytes, keys: Sequence[GroupKey]) -> Fragment | None:
-    """The fragment in a datagram; None if no member sent it, or in another way. Raises nothing."""
+    """The fragment in a datagram; None unless a member sent it in this version. Raises nothing."""
     if not _HEAD.size + _TAG_BYTES + _FRAGMENT.size <= len(data) <= DATAGRAM_BYTES:
         return None
     magic, version, fingerprint, nonce = _HEAD.unpack_from(data)
@@ -130,40 +127,39 @@ def open_datagram(data: bytes, keys: Sequence[GroupKey]) -> Fragment | None:
         opened: bytes = crypto_secretbox_open(data[_HEAD.size :], nonce, keys[which].secret)
     except CryptoError:
         return None
-    sender, place, of, envelope_head = _FRAGMENT.unpack_from(opened)
+    sender, index, count, envelope_head = _FRAGMENT.unpack_from(opened)
     head = read_head(envelope_head)
-    if not place < of <= MOST_FRAGMENTS or not (head or is_of_other_version(envelope_head)):
+    if not index < count <= MOST_FRAGMENTS or not (head or is_of_other_version(envelope_head)):
         return None
     part = opened[_FRAGMENT.size :]
-    number = head.number if head else NOTHING
-    return Fragment(which, sender, place, of, envelope_head, number, part)
+    number = head.number if head else NO_NUMBER
+    return Fragment(which, sender, index, count, envelope_head, number, part)
 
 
-# Pieces that say otherwise of their message are of another one: its number and the head that it is
-# from, of how many pieces it is, and the key.
-_Pieces = tuple[MessageNumber, bytes, int, int]
+# Number, head, count and key: fragments that differ in any belong to different messages.
+_MessageKey = tuple[MessageNumber, bytes, int, int]
 
 
 @dataclass(slots=True)
 class _Sender:
-    """Parts of one sender's messages; `key` is the newest that it spoke with."""
+    """State of one sender; `key` is the newest that it has used."""
 
-    newest: Newest = field(default_factory=Newest)
+    window: ReplayWindow = field(default_factory=ReplayWindow)
     newest_at_s: float = -math.inf
     key: int = sys.maxsize
-    partial: dict[_Pieces, dict[int, bytes]] = field(default_factory=dict)
+    partial: dict[_MessageKey, dict[int, bytes]] = field(default_factory=dict)
 
 
 class Assembly:
-    """Makes messages of fragments: all of them, or nothing. One thread at a time.
+    """Reassembles messages from fragments. One thread at a time.
 
-    What is not newer than what `heard` was told of is old, and dropped unseen: whatever a stranger
-    recorded and says again, and what came twice. So is what comes with a former key from a sender
-    who has the new one: it is who stole the former. A number counts once the message is known to be
-    its sender's.
+    Fragments not newer than the last confirmed message are dropped as replays or duplicates. So are
+    those with a former key from a sender that has used a newer one: a thief may have the former
+    key. `old` counts both. A number counts only after `confirm`.
 
-    `forget_after_s`: who was silent for longer may have started again with a clock that is behind.
-    Members' starts are numbered so that they never are (math.inf).
+    `forget_after_s`: a sender that was silent for longer may return with a smaller number, having
+    restarted with a clock that is behind. Members number their starts so that this never happens
+    (math.inf).
     """
 
     def __init__(self, forget_after_s: float = math.inf) -> None:
@@ -172,45 +168,45 @@ class Assembly:
         self.old = 0
 
     def add(self, fragment: Fragment, now_s: float, unix_s: float | None = None) -> bytes | None:
-        """The message that the fragment completes, if it does.
+        """The message that the fragment completes; None if it completes none.
 
-        `now_s` is a monotonic clock's, `unix_s` the wall clock's, as `Newest` takes them.
+        `now_s` is a monotonic clock's, `unix_s` the wall clock's, as for `ReplayWindow`.
         """
         sender = self._sender(fragment)
         silent = now_s - sender.newest_at_s > self._forget_after_s
-        is_older = sender.newest.is_older(fragment.number, now_s, unix_s)
-        if (is_older and not silent) or fragment.key > sender.key:
+        is_replay = sender.window.is_replay(fragment.number, now_s, unix_s)
+        if (is_replay and not silent) or fragment.key > sender.key:
             self.old += 1
             return None
-        if fragment.of == 1:
+        if fragment.part_count == 1:
             return fragment.head + fragment.part
-        which = fragment.number, fragment.head, fragment.of, fragment.key
-        parts = sender.partial.setdefault(which, {})
-        parts[fragment.place] = fragment.part
-        if len(parts) == fragment.of:
-            del sender.partial[which]
+        key = fragment.number, fragment.head, fragment.part_count, fragment.key
+        parts = sender.partial.setdefault(key, {})
+        parts[fragment.part_index] = fragment.part
+        if len(parts) == fragment.part_count:
+            del sender.partial[key]
             return fragment.head + b"".join(part for _, part in sorted(parts.items()))
         if len(sender.partial) > _MOST_PARTIAL:
-            # The one that began first: its rest is lost.
+            # The first to begin has lost a fragment.
             del sender.partial[next(iter(sender.partial))]
         return None
 
-    def heard(self, fragment: Fragment, now_s: float) -> None:
-        """The message that this fragment completed was its sender's, and so is its number."""
+    def confirm(self, fragment: Fragment, now_s: float) -> None:
+        """Record the number of an authenticated message, which this fragment completed."""
         sender = self._sender(fragment)
-        sender.newest.hear(fragment.number, now_s)
+        sender.window.accept(fragment.number, now_s)
         sender.newest_at_s = now_s
         sender.key = min(sender.key, fragment.key)
         sender.partial = {
-            which: parts for which, parts in sender.partial.items() if which[0] > fragment.number
+            key: parts for key, parts in sender.partial.items() if key[0] > fragment.number
         }
 
     def _sender(self, fragment: Fragment) -> _Sender:
-        who, senders = fragment.sender, self._senders
-        if who not in senders:
+        sender_id, senders = fragment.sender, self._senders
+        if sender_id not in senders:
             if len(senders) >= _MOST_SENDERS:
-                # A member may claim any number of ids: those go first of which nothing was heard,
-                # and then who was silent for longest.
+                # A member may claim any number of ids: forget first those without a confirmed
+                # message, and then the longest silent.
                 del senders[min(senders, key=lambda each: senders[each].newest_at_s)]
-            senders[who] = _Sender()
-        return senders[who]
+            senders[sender_id] = _Sender()
+        return senders[sender_id]

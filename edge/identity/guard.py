@@ -1,6 +1,6 @@
-"""Between a node and its link: what goes out is signed, what comes in is a member's or nobody's.
+"""Sign what a node publishes, and authenticate what it receives.
 
-Who a message is from is decided here, before anything of it is decoded and whatever brought it.
+A message's sender is decided here, before anything is decoded and whichever link delivered it.
 """
 
 import math
@@ -28,41 +28,41 @@ from edge.identity.envelope import (
     seal,
 )
 from edge.identity.members import Member, Members, Role, number_of
-from edge.identity.news import NOTHING, MessageNumber, Newest
+from edge.identity.replay_window import NO_NUMBER, MessageNumber, ReplayWindow
 from edge.identity.signature import Signer
 from edge.messages.topics import HOLD, Link, ReceiveCallback, Topic, robot_id_in
 
-# What was on its way when a member's program started again has come by then.
+# Messages in transit when a member's program restarted have arrived by then.
 _LONGEST_TRANSIT_S = 5.0
 _MOST_NAMED = 4
-# No clock is further ahead than a wrong time zone makes it; one that was lost is behind.
+# A wrong time zone sets a clock ahead by less than this; a clock that lost its time is behind.
 _MOST_AHEAD_MS = 24 * 3600e3
 
 
-class Speaker(Struct, frozen=True):
-    """Sender of a message, and its program: `name` is the list's, "" where nothing is signed.
+class Sender(Struct, frozen=True):
+    """Sender of a message: `name` is from the list of members, "" in a fleet without keys.
 
-    `number` is the message's; `release` and `members` are what the sender flies and knows.
+    `number` is the message's, `release` the sender's, `members` the digest of the sender's list.
     """
 
     role: Role
     name: str
-    number: MessageNumber = NOTHING
+    number: MessageNumber = NO_NUMBER
     release: bytes = RELEASE
     members: bytes = NO_MEMBERS
 
     @classmethod
-    def of(cls, role: Role, name: str, head: Head) -> "Speaker":
+    def of(cls, role: Role, name: str, head: Head) -> "Sender":
         """The sender of a message with that head."""
         return cls(role, name, head.number, head.release, head.members)
 
 
-# Of the key below `lpac/<fleet>/`, the payload and who said it; from any thread.
-Hear = Callable[[str, bytes, Speaker], None]
+# Takes the key below `lpac/<fleet>/`, the payload and the sender; called from any thread.
+MessageHandler = Callable[[str, bytes, Sender], None]
 
 
 class RefusedMessage(StrEnum):
-    """Why a message is nobody's."""
+    """Reason to refuse a message."""
 
     NO_ENVELOPE = "no_envelope"
     UNKNOWN_KEY = "unknown_key"
@@ -74,50 +74,53 @@ class RefusedMessage(StrEnum):
 
 
 @dataclass(slots=True)
-class _Heard:
-    """State of one member on one key; all times are a monotonic clock's, s."""
+class _Stream:
+    """State of one member's messages on one key; all times are a monotonic clock's, s."""
 
-    newest: Newest = field(default_factory=Newest)
+    window: ReplayWindow = field(default_factory=ReplayWindow)
     newest_s: float = -math.inf
-    # Digest of the list of members that it had then.
+    # Digest of the member's list in its newest message.
     members: bytes = NO_MEMBERS
-    # Its newest word every second or so, back to the longest transit ago.
-    before: deque[tuple[float, MessageNumber]] = field(default_factory=deque)
-    # Of its words behind the newest one: since when they come, until when, and the greatest.
-    behind_since_s: float = -math.inf
-    behind_s: float = -math.inf
-    behind: MessageNumber = NOTHING
-    # When such a word came last that was no longer on its way: a second program said it.
-    twice_s: float = -math.inf
+    # About one newest number a second, back to the longest transit ago.
+    history: deque[tuple[float, MessageNumber]] = field(default_factory=deque)
+    # Messages older than the newest: when they began, the last one's time, the greatest number.
+    late_since_s: float = -math.inf
+    late_s: float = -math.inf
+    late: MessageNumber = NO_NUMBER
+    # Time of the last message too late to have been in transit: a second program sent it.
+    duplicate_s: float = -math.inf
 
-    def hear(self, head: Head, now_s: float) -> None:
-        """It is news."""
+    def accept(self, head: Head, now_s: float) -> None:
+        """Record the newest message."""
         number = head.number
-        self.newest.hear(number, now_s)
+        self.window.accept(number, now_s)
         self.newest_s, self.members = now_s, head.members
-        if not self.before or now_s - self.before[-1][0] >= 1.0:
-            self.before.append((now_s, number))
-        while len(self.before) > 1 and now_s - self.before[1][0] > _LONGEST_TRANSIT_S:
-            self.before.popleft()
+        if not self.history or now_s - self.history[-1][0] >= 1.0:
+            self.history.append((now_s, number))
+        while len(self.history) > 1 and now_s - self.history[1][0] > _LONGEST_TRANSIT_S:
+            self.history.popleft()
 
-    def hear_behind(self, number: MessageNumber, now_s: float) -> None:
-        """It is none: of two programs with one key the one that started last is heard."""
-        if now_s - self.behind_s > _LONGEST_TRANSIT_S:
-            self.behind_since_s, self.behind = now_s, NOTHING
-        if number <= self.behind:
+    def record_late(self, number: MessageNumber, now_s: float) -> None:
+        """Record a message older than the newest, to detect two programs with one key.
+
+        Only the program that started last is accepted.
+        """
+        if now_s - self.late_s > _LONGEST_TRANSIT_S:
+            self.late_since_s, self.late = now_s, NO_NUMBER
+        if number <= self.late:
             return
-        self.behind_s, self.behind = now_s, number
-        said = [*self.before, (self.newest_s, self.newest.number)]
-        settled = [n for at_s, n in said if now_s - at_s > _LONGEST_TRANSIT_S]
-        goes_on = now_s - self.behind_since_s > _LONGEST_TRANSIT_S
-        if goes_on and settled and number <= settled[-1]:
-            self.twice_s = now_s
+        self.late_s, self.late = now_s, number
+        accepted = [*self.history, (self.newest_s, self.window.number)]
+        settled = [n for at_s, n in accepted if now_s - at_s > _LONGEST_TRANSIT_S]
+        persists = now_s - self.late_since_s > _LONGEST_TRANSIT_S
+        if persists and settled and number <= settled[-1]:
+            self.duplicate_s = now_s
 
 
 class Guard(ABC):
-    """Interface through which a node speaks and hears. From any thread.
+    """Interface through which a node publishes and receives. Call its methods from any thread.
 
-    What is known of members here is what is known in a fleet without keys: nothing.
+    The defaults are those of a fleet without keys, which has no list of members.
     """
 
     def __init__(self, release: bytes) -> None:
@@ -125,78 +128,80 @@ class Guard(ABC):
         self._lock = Lock()
         self._sequences: Counter[str] = Counter()
         self._refused: Counter[RefusedMessage] = Counter()
-        self._strangers: set[int] = set()
+        self._unreadable_robots: set[int] = set()
 
     @property
     def role(self) -> Role | None:
-        """Role that it speaks in; None where messages are not signed."""
+        """This program's role; None where messages are not signed."""
         return None
 
-    def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
-        """Callbacks to open the link with, so that the node hears these topics."""
-        return {topic: partial(self._receive, topic, callback) for topic, callback in hear.items()}
+    def subscriptions(
+        self, handlers: Mapping[Topic, MessageHandler]
+    ) -> dict[Topic, ReceiveCallback]:
+        """Callbacks for the link: they pass authenticated messages to the handlers."""
+        return {topic: partial(self._receive, topic, each) for topic, each in handlers.items()}
 
-    def over(self, link: Link) -> Link:
-        """Link for the node to publish on, which passes on to this one."""
+    def wrap(self, link: Link) -> Link:
+        """A link that seals messages and publishes them on this one."""
         return _SealingLink(self, link)
 
     @abstractmethod
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """The payload in this sender's envelope."""
 
-    def is_listed(self) -> bool:
-        """Whether the list of members has this program's key: else nobody listens to it."""
+    def is_member(self) -> bool:
+        """Whether the list of members has this program's key; else all members refuse it."""
         return True
 
     def members_differ(self) -> str:
-        """Describe who of those heard lately has another list of members; "" if nobody has."""
+        """Describe which recent senders have another list of members; "" if none has."""
         return ""
 
     def revoked_robots(self) -> frozenset[int]:
-        """Robots that are listened to no more, and may still fly."""
+        """Robots of an earlier list of members: they are refused, and may still fly."""
         return frozenset()
 
-    def robots_said_twice(self) -> frozenset[int]:
-        """Robots whose key two programs have: the own one among them, if it is said elsewhere."""
+    def duplicate_robots(self) -> frozenset[int]:
+        """Robots whose key two programs use, this robot included."""
         return frozenset()
 
-    def robots_ahead(self) -> frozenset[int]:
-        """Robots that number their starts further ahead of the clock than one can be wrong."""
+    def robots_with_future_start(self) -> frozenset[int]:
+        """Robots whose start number is more than a day ahead of the clock: refused."""
         return frozenset()
 
-    def hear_time(self, unix_s: float) -> None:  # noqa: B027  (an open fleet has no use for it)
-        """It is at least so late; robots whose start lies more than a day ahead are not heard."""
+    def receive_time(self, unix_s: float) -> None:  # noqa: B027  (no use in an open fleet)
+        """Take a lower bound of the time, by which future starts are refused."""
 
-    def take_strangers(self) -> set[int]:
-        """Robots that sent envelopes of another version since this was called last."""
+    def pop_unreadable_robots(self) -> set[int]:
+        """Robots that sent envelopes of another version since the last call."""
         with self._lock:
-            robots, self._strangers = self._strangers, set()
+            robots, self._unreadable_robots = self._unreadable_robots, set()
         return robots
 
     def refused(self) -> dict[str, int]:
-        """How many messages were nobody's, by why."""
+        """Counts of refused messages, by `RefusedMessage`."""
         with self._lock:
             return {reason.value: count for reason, count in self._refused.items()}
 
     @abstractmethod
-    def _opened(
+    def _authenticate(
         self, topic: Topic, key: str, envelope: Envelope
-    ) -> tuple[bytes, Speaker] | RefusedMessage:
-        """Payload and sender of a message that came on that key."""
+    ) -> tuple[bytes, Sender] | RefusedMessage:
+        """Payload and sender of a message received on that key."""
 
-    def _receive(self, topic: Topic, hear: Hear, key: str, data: bytes) -> bool:
+    def _receive(self, topic: Topic, handler: MessageHandler, key: str, data: bytes) -> bool:
         robot_id = robot_id_in(key)
         if topic.sender == "robot" and robot_id is None:
             self._refuse(RefusedMessage.NOT_ALLOWED, key)
             return False
         envelope = read_envelope(data)
-        found: tuple[bytes, Speaker] | RefusedMessage = RefusedMessage.NO_ENVELOPE
+        found: tuple[bytes, Sender] | RefusedMessage = RefusedMessage.NO_ENVELOPE
         if envelope is not None:
-            found = self._opened(topic, key, envelope)
+            found = self._authenticate(topic, key, envelope)
         elif robot_id is not None and is_of_other_version(data):
-            # Nobody knows whether that robot sent it.
+            # The signature is unknown in this version: that robot may not have sent it.
             with self._lock:
-                self._strangers.add(robot_id)
+                self._unreadable_robots.add(robot_id)
         if not isinstance(found, RefusedMessage) and topic.deflated:
             payload = inflate(found[0], topic.limit_bytes)
             found = (
@@ -207,7 +212,7 @@ class Guard(ABC):
         if isinstance(found, RefusedMessage):
             self._refuse(found, key)
             return False
-        hear(key, found[0], found[1])
+        handler(key, found[0], found[1])
         return True
 
     def _refuse(self, reason: RefusedMessage, key: str) -> None:
@@ -215,7 +220,7 @@ class Guard(ABC):
             self._refused[reason] += 1
             first = self._refused[reason] == 1
         if first:
-            log.warning("a message is not listened to", why=reason.value, key=key)
+            log.warning("message refused", why=reason.value, key=key)
 
     def _next_sequence(self, key: str) -> int:
         with self._lock:
@@ -224,10 +229,10 @@ class Guard(ABC):
 
 
 class Unguarded(Guard):
-    """Messages are not signed, and are taken for those of the keys that they come on.
+    """Guard of a fleet without keys: a message's sender is the one that its key names.
 
-    For a radio that nobody else can reach. `start` tells this start of the program from all before,
-    which were smaller.
+    For a radio that nobody else can reach. `start` is greater than at each earlier start of the
+    program.
     """
 
     def __init__(self, start: int, release: bytes = RELEASE) -> None:
@@ -239,21 +244,21 @@ class Unguarded(Guard):
         number = MessageNumber(self._start, self._next_sequence(topic.pattern))
         return enclose(_packed(topic, payload), number, release=self.release)
 
-    def _opened(
+    def _authenticate(
         self, topic: Topic, key: str, envelope: Envelope
-    ) -> tuple[bytes, Speaker] | RefusedMessage:
+    ) -> tuple[bytes, Sender] | RefusedMessage:
         if envelope.head.is_signed:
             return RefusedMessage.NO_ENVELOPE
         role = Role.ROBOT if key.startswith("robot/") else Role.OPERATOR
-        return envelope.payload, Speaker.of(role, "", envelope.head)
+        return envelope.payload, Sender.of(role, "", envelope.head)
 
 
 @dataclass(frozen=True, slots=True)
 class Membership:
-    """One program's place in its fleet.
+    """One program's membership in its fleet.
 
-    `own` is the member that it is, if the list says so, `members` the list as it begins, `start`
-    what tells this start of the program from all before, which were smaller.
+    `own` is its own member, `members` the list at the start, `start` a number greater than at each
+    earlier start of the program.
     """
 
     own: Member
@@ -263,10 +268,7 @@ class Membership:
 
 
 class SignedGuard(Guard):
-    """The guard of a member.
-
-    `members` is the list that counts now: whoever is not in it is not heard.
-    """
+    """The guard of a member: it refuses senders that are not in `members`, the present list."""
 
     def __init__(
         self, membership: Membership, clock_s: Callable[[], float], release: bytes = RELEASE
@@ -277,29 +279,28 @@ class SignedGuard(Guard):
         self._signer = membership.signer
         self._start = membership.start
         self._clock_s = clock_s
-        # Robots of an earlier list that are in the list no more.
-        self._left: frozenset[int] = frozenset()
-        self._heard: defaultdict[tuple[bytes, str], _Heard] = defaultdict(_Heard)
-        # When a key's start lay ahead of the clock; when the own key was said by a later start.
-        self._ahead_s: dict[bytes, float] = {}
-        self._own_said_s = -math.inf
-        # The wall clock minus the monotonic one, once it is known.
+        self._revoked: frozenset[int] = frozenset()
+        self._streams: defaultdict[tuple[bytes, str], _Stream] = defaultdict(_Stream)
+        # Time of each key's last start ahead of the clock, and of a later start of the own key.
+        self._future_start_s: dict[bytes, float] = {}
+        self._own_key_s = -math.inf
+        # The wall clock minus the monotonic one; None until known.
         self._unix_offset_s: float | None = None
 
-    def take(self, members: Members) -> None:
-        """Take a newer list, from now on. Raises MembersError if it is none."""
+    def update_members(self, members: Members) -> None:
+        """Replace the list of members by a newer one. Raises MembersError if it is none."""
         with self._lock:
             self.members.require_newer(members)
             if members != self.members:
-                former = self._left | self.members.robot_ids
-                self._left, self.members = former - members.robot_ids, members
+                former = self._revoked | self.members.robot_ids
+                self._revoked, self.members = former - members.robot_ids, members
 
     @property
     def role(self) -> Role:
         """See `Guard`."""
         return self._own.role
 
-    def is_listed(self) -> bool:
+    def is_member(self) -> bool:
         """See `Guard`."""
         listed = self.members.by_key.get(self._own.fingerprint)
         return listed is not None and listed.place == self._own.place
@@ -307,11 +308,11 @@ class SignedGuard(Guard):
     def members_differ(self) -> str:
         """See `Guard`."""
         since_s, members = self._clock_s() - _LONGEST_TRANSIT_S, self.members
-        newest: dict[bytes, _Heard] = {}
+        newest: dict[bytes, _Stream] = {}
         with self._lock:
-            for (key, _), heard in self._heard.items():
-                if heard.newest_s >= max(since_s, newest.get(key, heard).newest_s):
-                    newest[key] = heard
+            for (key, _), stream in self._streams.items():
+                if stream.newest_s >= max(since_s, newest.get(key, stream).newest_s):
+                    newest[key] = stream
         others = [
             f"{sender.name} has {_compared(number_of(newest[key].members), members.number)}"
             for key, sender in members.by_key.items()
@@ -320,56 +321,55 @@ class SignedGuard(Guard):
         if not others:
             return ""
         more = [f"and {len(others) - _MOST_NAMED} more"] if len(others) > _MOST_NAMED else []
-        said = ", ".join(others[:_MOST_NAMED] + more)
-        return f"the list of members here is {members.number}, and {said}: run `lpac fleet up`"
+        differ = ", ".join(others[:_MOST_NAMED] + more)
+        return f"the list of members here is {members.number}, and {differ}: run `lpac fleet up`"
 
     def revoked_robots(self) -> frozenset[int]:
         """See `Guard`."""
-        return self._left
+        return self._revoked
 
-    def robots_said_twice(self) -> frozenset[int]:
+    def duplicate_robots(self) -> frozenset[int]:
         """See `Guard`."""
         since_s = self._clock_s() - _LONGEST_TRANSIT_S
         with self._lock:
-            heard = {key for (key, _), said in self._heard.items() if said.newest_s >= since_s}
-            twice = {key for (key, _), said in self._heard.items() if said.twice_s >= since_s}
-            ahead = {key for key, at_s in self._ahead_s.items() if at_s >= since_s}
-        own = {self._own.fingerprint} if self._own_said_s >= since_s else set()
-        return self._robots(twice | (ahead & heard) | own)
+            streams = self._streams.items()
+            recent = {key for (key, _), stream in streams if stream.newest_s >= since_s}
+            duplicate = {key for (key, _), stream in streams if stream.duplicate_s >= since_s}
+            future = {key for key, at_s in self._future_start_s.items() if at_s >= since_s}
+        own = {self._own.fingerprint} if self._own_key_s >= since_s else set()
+        return self._robots(duplicate | (future & recent) | own)
 
-    def robots_ahead(self) -> frozenset[int]:
+    def robots_with_future_start(self) -> frozenset[int]:
         """See `Guard`."""
         since_s = self._clock_s() - _LONGEST_TRANSIT_S
         with self._lock:
-            return self._robots({key for key, at_s in self._ahead_s.items() if at_s >= since_s})
+            return self._robots(
+                {key for key, at_s in self._future_start_s.items() if at_s >= since_s}
+            )
 
     def _robots(self, fingerprints: Iterable[bytes]) -> frozenset[int]:
         found = (self.members.by_key.get(fingerprint) for fingerprint in fingerprints)
         return frozenset(m.robot_id for m in found if m and m.robot_id is not None)
 
-    def hear_time(self, unix_s: float) -> None:
+    def receive_time(self, unix_s: float) -> None:
         """See `Guard`."""
         offset_s = unix_s - self._clock_s()
-        # A clock that is set back in flight makes nobody's start too great who was heard before.
+        # A clock set back in flight must not make known starts lie in the future.
         if self._unix_offset_s is None or offset_s > self._unix_offset_s:
             self._unix_offset_s = offset_s
-
-    # At the port, before there is a connection: see `edge.drivers.door`
 
     def knock(self, place: str) -> bytes:
         """See `edge.messages.topics.Knocking`."""
         return self._seal(_knock_key(self._own, place), b"")
 
     def is_knock(self, data: bytes, place: str) -> bool:
-        """See `edge.messages.topics.Knocking`. A robot's own knock, said again, is none."""
+        """See `edge.messages.topics.Knocking`. A replay of a robot's own knock is none."""
         envelope = read_envelope(data)
         sender = None if envelope is None else self.members.by_key.get(envelope.head.fingerprint)
         if envelope is None or sender is None:
             return False
         key = _knock_key(sender, place)
-        return self._problem(key, sender, envelope) is None
-
-    # What goes out
+        return self._verify(key, sender, envelope) is None
 
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """See `Guard`."""
@@ -385,75 +385,71 @@ class SignedGuard(Guard):
             release=self.release,
         )
 
-    # What comes in
-
-    def _opened(
+    def _authenticate(
         self, topic: Topic, key: str, envelope: Envelope
-    ) -> tuple[bytes, Speaker] | RefusedMessage:
+    ) -> tuple[bytes, Sender] | RefusedMessage:
         sender = self.members.by_key.get(envelope.head.fingerprint)
         if sender is None:
             return RefusedMessage.UNKNOWN_KEY
-        if not _may_say(sender, topic, key):
+        if not _may_publish(sender, topic, key):
             return RefusedMessage.NOT_ALLOWED
-        problem = self._problem(key, sender, envelope)
-        if problem is not None:
-            return problem
-        return envelope.payload, Speaker.of(sender.role, sender.name, envelope.head)
+        refused = self._verify(key, sender, envelope)
+        if refused is not None:
+            return refused
+        return envelope.payload, Sender.of(sender.role, sender.name, envelope.head)
 
-    def _problem(self, key: str, sender: Member, envelope: Envelope) -> RefusedMessage | None:
-        """Why it is not that member's newest word there; else it is heard."""
+    def _verify(self, key: str, sender: Member, envelope: Envelope) -> RefusedMessage | None:
+        """Record that member's newest message on that key, or return why it is refused."""
         if not envelope.is_from(sender.public_key, Address(self.members.authority, key)):
             return RefusedMessage.FORGED
-        return self._overtaken(key, sender, envelope)
+        return self._check_number(key, sender, envelope.head)
 
-    def _overtaken(self, key: str, sender: Member, envelope: Envelope) -> RefusedMessage | None:
-        """Why the member's word does not count, if its number is the reason; else it is heard."""
-        number = envelope.head.number
+    def _check_number(self, key: str, sender: Member, head: Head) -> RefusedMessage | None:
+        number, fingerprint = head.number, head.fingerprint
         now_s, offset_s = self._clock_s(), self._unix_offset_s
         unix_s = None if offset_s is None else now_s + offset_s
-        # A ground whose computer's clock was wrong once would be out of reach in flight.
+        # Robots alone: a ground whose clock was wrong once would be out of reach in flight.
         is_robot = sender.role is Role.ROBOT
-        fingerprint = envelope.head.fingerprint
         is_own = fingerprint == self._own.fingerprint and is_robot
         with self._lock:
             if is_own and number.start <= self._start:
-                # A robot's own word, said again. Another program with this key, if there is one
-                # and it began earlier, hears this one.
+                # A replay, or another program with this key that started earlier: that program
+                # receives this one, and reports the duplicate.
                 return RefusedMessage.REPLAYED
             if is_own:
-                self._own_said_s = now_s
+                self._own_key_s = now_s
             if is_robot and unix_s is not None and number.start > 1e3 * unix_s + _MOST_AHEAD_MS:
-                self._ahead_s[fingerprint] = now_s
+                self._future_start_s[fingerprint] = now_s
                 return RefusedMessage.START_AHEAD
-            heard = self._heard[fingerprint, key]
-            if heard.newest.is_older(number, now_s, unix_s):
-                heard.hear_behind(number, now_s)
+            stream = self._streams[fingerprint, key]
+            if stream.window.is_replay(number, now_s, unix_s):
+                stream.record_late(number, now_s)
                 return RefusedMessage.REPLAYED
-            heard.hear(envelope.head, now_s)
+            stream.accept(head, now_s)
         return None
 
 
 class _SealingLink:
-    """A link on which everything is in an envelope."""
+    """A link that publishes every message in an envelope."""
 
     def __init__(self, guard: Guard, link: Link) -> None:
         self._guard = guard
         self._link = link
 
     def publish(self, topic: Topic, data: bytes) -> None:
-        """Send to whoever listens; it may be lost."""
+        """See `Link`."""
         self._link.publish(topic, self._guard.seal(topic, data))
 
     def is_claimed(self, robot_id: int) -> bool:
-        """Whether another program than this one says that it is that robot."""
+        """See `Link`."""
         return self._link.is_claimed(robot_id)
 
     def peers(self) -> int:
-        """How many others it reaches now."""
+        """See `Link`."""
         return self._link.peers()
 
     def refused(self) -> int:
-        """How many messages it did not look at."""
+        """See `Link`."""
         return self._link.refused()
 
 
@@ -474,7 +470,7 @@ def _prefix(sender: Member) -> str:
     return "ground" if sender.robot_id is None else f"robot/{sender.robot_id}"
 
 
-def _may_say(sender: Member, topic: Topic, key: str) -> bool:
+def _may_publish(sender: Member, topic: Topic, key: str) -> bool:
     """An observer may ask for a hold, and nothing else."""
     return key == _key(sender, topic) and (sender.role is not Role.OBSERVER or topic == HOLD)
 

@@ -1,12 +1,13 @@
-"""List of a fleet's members: a text file, as authorized_keys is, which the laptop writes.
+"""List of a fleet's members: a text file like authorized_keys, which the laptop writes.
 
     fleet demo 7 2 <the authority's public key>
     operator ann - <public key>
     robot r3 3 <public key>
 
-The first line has the fleet's name, the list's number, which grows with every change, and how many
-members follow, by which a torn file is told. A member is its role, name, robot id, and public key;
-keys are in hexadecimal digits. Empty lines, and lines that begin with #, are comments.
+The first line has the fleet's name, the list's number, the count of members, and the authority's
+public key. The number grows with every change; the count reveals a torn file. Each member has a
+role, name, robot id, and public key. Keys are hexadecimal. Empty lines, and lines that begin with
+#, are ignored.
 """
 
 import hashlib
@@ -34,11 +35,11 @@ ListNumber = Annotated[int, Meta(ge=1, lt=2 ** (8 * _NUMBER_BYTES))]
 
 
 class MembersError(ValueError):
-    """It is no list of this fleet's members, or an older one; one line says why."""
+    """A list of members that cannot be used: not this fleet's, older or malformed; one line."""
 
 
 class Role(StrEnum):
-    """A robot speaks for itself, an operator for the ground; an observer asks for a hold only."""
+    """Role of a member: operators command, observers may only ask for a hold."""
 
     ROBOT = "robot"
     OPERATOR = "operator"
@@ -56,16 +57,16 @@ class Member:
 
     def __post_init__(self) -> None:
         if (self.role is Role.ROBOT) != (self.robot_id is not None):
-            raise ValueError(f"robot_id = {self.robot_id}: a robot has one, and nobody else")
+            raise ValueError(f"robot_id = {self.robot_id}: robots alone must have one")
 
     @property
     def fingerprint(self) -> bytes:
-        """Its key's."""
+        """Fingerprint of its key."""
         return fingerprint(self.public_key)
 
     @property
     def place(self) -> tuple[Role, str]:
-        """Place in the fleet, which one member has: a robot's id, or a ground station's name."""
+        """Unique place in the fleet: a robot's id, or a ground station's name."""
         return self.role, self.name if self.robot_id is None else str(self.robot_id)
 
     @property
@@ -77,7 +78,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Members:
-    """A list. Raises MembersError if two members have one key or one place."""
+    """A list of members. Raises MembersError if two have one key or one place."""
 
     fleet: str
     number: int
@@ -91,7 +92,7 @@ class Members:
 
     @cached_property
     def by_key(self) -> dict[bytes, Member]:
-        """Member of each key, by its fingerprint."""
+        """Members, by the fingerprints of their keys."""
         return {member.fingerprint: member for member in self.members}
 
     @property
@@ -107,12 +108,12 @@ class Members:
 
     @cached_property
     def digest(self) -> bytes:
-        """Digest in the head of each message: the number, and two bytes of the text's SHA-256."""
+        """Digest in each message's head: the number, and two bytes of the text's SHA-256."""
         text = hashlib.sha256(self.text.encode()).digest()
         return self.number.to_bytes(_NUMBER_BYTES, "big") + text[:_HASH_BYTES]
 
     def require_newer(self, later: "Members") -> None:
-        """Raise MembersError unless `later` may take the place of this list, or is this list."""
+        """Raise MembersError unless `later` is this list, or a newer one of the same fleet."""
         if (later.fleet, later.authority) != (self.fleet, self.authority):
             raise MembersError(f"members: is another fleet's {later.fleet!r}, not {self.fleet!r}")
         if later.number < self.number or (later.number == self.number and later != self):
@@ -120,12 +121,12 @@ class Members:
 
 
 def number_of(digest: bytes) -> int:
-    """Number of the list that has this digest."""
+    """Number of the list with this digest."""
     return int.from_bytes(digest[:_NUMBER_BYTES], "big")
 
 
 def parse_members(text: str) -> Members:
-    """The list in the text of its file. Raises MembersError."""
+    """The list in a file's text. Raises MembersError."""
     lines = [line.split() for line in text.splitlines()]
     lines = [line for line in lines if line and not line[0].startswith("#")]
     if not lines or len(lines[0]) != len(_HEAD) or lines[0][0] != _HEAD[0]:

@@ -1,6 +1,6 @@
-"""Ed25519 (RFC 8032), which every message is signed with.
+"""Ed25519 signatures of messages (RFC 8032).
 
-Keys are their bytes: 32 of a secret key's seed, 32 of a public key, 64 of a signature.
+All are bytes: 32 of a secret key's seed, 32 of a public key, 64 of a signature.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ FINGERPRINT_BYTES = 8
 
 
 class Signer:
-    """A secret key. From any thread."""
+    """A secret key. Call its methods from any thread."""
 
     def __init__(self, seed: bytes) -> None:
         """Raises ValueError if the seed is not 32 bytes."""
@@ -30,7 +30,7 @@ class Signer:
 
 
 def is_signed(message: bytes, signature: bytes, public_key: bytes) -> bool:
-    """Whether the key's owner signed just that; raises nothing, whatever the bytes."""
+    """Whether the key's owner signed the message. Raises nothing, whatever the bytes."""
     try:
         crypto_sign_open(signature + message, public_key)
     except (BadSignatureError, ValueError):
@@ -41,7 +41,7 @@ def is_signed(message: bytes, signature: bytes, public_key: bytes) -> bool:
 def fingerprint(public_key: bytes) -> bytes:
     """Fingerprint of a key: the first 8 bytes of its SHA-256.
 
-    Long enough that nobody finds a second key of the same name among a fleet's; what a message is
-    worth is decided by the whole key.
+    Nobody can find a second key with a member's fingerprint; signatures are verified with the whole
+    key.
     """
     return hashlib.sha256(public_key).digest()[:FINGERPRINT_BYTES]

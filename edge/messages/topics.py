@@ -13,7 +13,7 @@ from edge.core.wire import MAX_ROBOT_ID
 
 _ROBOT_KEY = re.compile(r"robot/(0|[1-9][0-9]{0,4})/")
 
-Sender = Literal["robot", "ground"]
+SenderKind = Literal["robot", "ground"]
 Priority = Literal["now", "later"]
 
 
@@ -29,7 +29,7 @@ class Topic(NamedTuple):
     """
 
     name: str
-    sender: Sender
+    sender: SenderKind
     content: str
     rate_hz: float
     most_hz: float

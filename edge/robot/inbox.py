@@ -11,7 +11,7 @@ from threading import Lock
 from typing import NamedTuple
 
 from edge.identity.envelope import RELEASE
-from edge.identity.guard import Speaker
+from edge.identity.guard import Sender
 from edge.identity.members import Role
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import (
@@ -34,7 +34,7 @@ _HEARD_WITHIN_S = 5.0
 
 class _Arrived(NamedTuple):
     data: bytes
-    speaker: Speaker
+    sender: Sender
     at_s: float
 
 
@@ -78,21 +78,21 @@ class Inbox:
         self.not_understood_count = 0
         self._heard_by_ground: dict[int, _HeardByGround] = {}
 
-    def put_ground(self, data: bytes, speaker: Speaker, now_s: float) -> None:
+    def put_ground(self, data: bytes, sender: Sender, now_s: float) -> None:
         """A ground's state arrived."""
-        self._grounds.append(_Arrived(data, speaker, now_s))
+        self._grounds.append(_Arrived(data, sender, now_s))
 
-    def put_hold(self, data: bytes, speaker: Speaker, now_s: float) -> None:
+    def put_hold(self, data: bytes, sender: Sender, now_s: float) -> None:
         """A station's hold arrived."""
-        self._holds.append(_Arrived(data, speaker, now_s))
+        self._holds.append(_Arrived(data, sender, now_s))
 
     def put_world(self, data: bytes) -> None:
         """A world file arrived."""
         self.world = data
 
-    def put_order(self, data: bytes, speaker: Speaker, now_s: float) -> None:
+    def put_order(self, data: bytes, sender: Sender, now_s: float) -> None:
         """An order arrived."""
-        self._orders.append(_Arrived(data, speaker, now_s))
+        self._orders.append(_Arrived(data, sender, now_s))
 
     def put_stranger(self, name: str, now_s: float) -> None:
         """A robot's message arrived that could not be read."""
@@ -111,11 +111,11 @@ class Inbox:
                 self.ground_refusal = str(error)
                 self._take_safety_request(arrived)
                 continue
-            if _is_own(state.operator, arrived.speaker) and self._counts(state, arrived.at_s):
+            if _is_own(state.operator, arrived.sender) and self._counts(state, arrived.at_s):
                 self._ground, self._ground_at_s = state, arrived.at_s
                 self._put_echoes(state, arrived.at_s)
                 self._refused_asks, self.ground_refusal = "none", ""
-                self._note_release(arrived.speaker)
+                self._note_release(arrived.sender)
         return self._with_asked_hold(now_s), now_s - self._ground_at_s
 
     def _put_echoes(self, state: GroundState, at_s: float) -> None:
@@ -134,7 +134,7 @@ class Inbox:
             except MessageError:
                 self.not_understood_count += 1
                 continue
-            if hold.is_of(self._robot_id) and arrived.speaker.name in ("", hold.by):
+            if hold.is_of(self._robot_id) and arrived.sender.name in ("", hold.by):
                 self._held_by, self._held_at_s = hold.by, arrived.at_s
         ground = self._ground
         if (
@@ -162,14 +162,14 @@ class Inbox:
             request = decode(SafetyRequest, arrived.data)
         except MessageError:
             return
-        if _is_own(request.operator, arrived.speaker) and self._counts(request, arrived.at_s):
+        if _is_own(request.operator, arrived.sender) and self._counts(request, arrived.at_s):
             asked = request.safety_action_for(self._robot_id)
             self._refused_asks = asked if asked in ("hold", "land") else "none"
             self._refused_at_s = arrived.at_s
-            self._note_release(arrived.speaker)
+            self._note_release(arrived.sender)
 
-    def _note_release(self, speaker: Speaker) -> None:
-        self.other_release = "" if speaker.release == self._release else speaker.release.hex()
+    def _note_release(self, sender: Sender) -> None:
+        self.other_release = "" if sender.release == self._release else sender.release.hex()
 
     def _counts(self, state: SafetyRequest, at_s: float) -> bool:
         newest = self._ground
@@ -194,13 +194,13 @@ class Inbox:
         What came since was made by a later uptime than the tick's, and would seem valid too long.
         """
         while self._orders and self._orders[0].at_s <= now_s:
-            data, speaker, _ = self._orders.popleft()
+            data, sender, _ = self._orders.popleft()
             try:
                 order = decode(Order, data)
             except MessageError:
                 self.not_understood_count += 1
                 continue
-            if order.robot_id == self._robot_id and _is_own(order.operator, speaker):
+            if order.robot_id == self._robot_id and _is_own(order.operator, sender):
                 return order
         return None
 
@@ -234,6 +234,6 @@ def _ground_state(data: bytes) -> GroundState:
     return decode(GroundState, data)
 
 
-def _is_own(operator: str, speaker: Speaker) -> bool:
+def _is_own(operator: str, sender: Sender) -> bool:
     """Whether who says it is the operator that it names, as far as that is known."""
-    return speaker.role is Role.OPERATOR and speaker.name in ("", operator)
+    return sender.role is Role.OPERATOR and sender.name in ("", operator)

@@ -13,7 +13,7 @@ from edge.core.logger import log
 from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
 from edge.core.vehicle import Action, VehicleState
 from edge.flight.state import flown_s, in_air
-from edge.identity.guard import Guard, Speaker
+from edge.identity.guard import Guard, Sender
 from edge.messages.beacon import BEACON_BYTES, decode_beacon, encode_beacon, tag
 from edge.messages.bounds import MOST_TEXTS
 from edge.messages.codec import MessageError, encode
@@ -177,41 +177,41 @@ class RobotNode:
 
     def attach(self, link: Link) -> None:
         """Set the link to publish on from now on."""
-        self._link = self._guard.over(link)
+        self._link = self._guard.wrap(link)
 
-    def _receive_state(self, _: str, data: bytes, speaker: Speaker) -> None:
-        self._inbox.put_ground(data, speaker, self._ports.clock.monotonic_s())
+    def _receive_state(self, _: str, data: bytes, sender: Sender) -> None:
+        self._inbox.put_ground(data, sender, self._ports.clock.monotonic_s())
 
-    def _receive_hold(self, _: str, data: bytes, speaker: Speaker) -> None:
-        self._inbox.put_hold(data, speaker, self._ports.clock.monotonic_s())
+    def _receive_hold(self, _: str, data: bytes, sender: Sender) -> None:
+        self._inbox.put_hold(data, sender, self._ports.clock.monotonic_s())
 
-    def _receive_order(self, _: str, data: bytes, speaker: Speaker) -> None:
-        self._inbox.put_order(data, speaker, self._ports.clock.monotonic_s())
+    def _receive_order(self, _: str, data: bytes, sender: Sender) -> None:
+        self._inbox.put_order(data, sender, self._ports.clock.monotonic_s())
 
-    def _receive_world(self, _: str, data: bytes, __: Speaker) -> None:
+    def _receive_world(self, _: str, data: bytes, __: Sender) -> None:
         self._inbox.put_world(data)
 
-    def _receive_message(self, key: str, data: bytes, speaker: Speaker) -> None:
+    def _receive_message(self, key: str, data: bytes, sender: Sender) -> None:
         """A robot's: to the table of neighbours, and what came to the log."""
         now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
-        sender = robot_id_in(key)
-        if sender is None:
+        robot_id = robot_id_in(key)
+        if robot_id is None:
             return
         rejection = age_s = None
         try:
-            release = "" if speaker.release == self._guard.release else speaker.release.hex()
-            beacon = decode_beacon(data, sender, release)
+            release = "" if sender.release == self._guard.release else sender.release.hex()
+            beacon = decode_beacon(data, robot_id, release)
         except MessageError:
-            self._inbox.put_stranger(f"robot {sender}", now_s)
+            self._inbox.put_stranger(f"robot {robot_id}", now_s)
         else:
             age_s = self._pac.age_s(beacon, now_s)
-            rejection = self._pac.receive(beacon, speaker.number, data[BEACON_BYTES:], now_s)
+            rejection = self._pac.receive(beacon, sender.number, data[BEACON_BYTES:], now_s)
         self._ports.recorder.record(
             "received",
             unix_now_s,
             {
-                "sender": sender,
-                "sequence": speaker.number.sequence,
+                "sender": robot_id,
+                "sequence": sender.number.sequence,
                 "age_s": age_s,
                 "rejection": rejection,
             },
@@ -312,8 +312,8 @@ class RobotNode:
         # A robot's own wall clock may be wrong: there is no internet on a field.
         ground_unix_s = self._inbox.ground_unix_s(now_s)
         if ground_unix_s is not None:
-            self._guard.hear_time(max(ground_unix_s, self._ports.clock.unix_s()))
-        for robot_id in self._guard.take_strangers():
+            self._guard.receive_time(max(ground_unix_s, self._ports.clock.unix_s()))
+        for robot_id in self._guard.pop_unreadable_robots():
             self._inbox.put_stranger(f"robot {robot_id}", now_s)
         time = self._pac.clock.at(now_s)
         control.checks = self.readiness.checks(
@@ -328,7 +328,7 @@ class RobotNode:
             fell_silent=control.fell_silent,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),
-            is_listed=self._guard.is_listed(),
+            is_member=self._guard.is_member(),
             members_differ=self._guard.members_differ(),
             ground_age_s=control.ground_age_s(now_s),
             time_uncertainty_s=None if time is None else time.uncertainty_s,
@@ -468,7 +468,7 @@ class RobotNode:
         if self._is_duplicate():
             text = f"another program says that it is robot {self._config.robot_id}"
             alarms.append(Reason(ReasonCode.DUPLICATE_ID, text))
-        twice = sorted(self._guard.robots_said_twice() - {self._config.robot_id})
+        twice = sorted(self._guard.duplicate_robots() - {self._config.robot_id})
         if twice:
             text = f"two programs have the key of robot {', '.join(map(str, twice))}: end one, or "
             alarms.append(Reason(ReasonCode.SAID_TWICE, f"{text}revoke it and restart the robot"))
@@ -481,7 +481,7 @@ class RobotNode:
         if self.identity_problem:
             text = f"what the next start has to know is not written: {self.identity_problem}"
             alarms.append(Reason(ReasonCode.IDENTITY_NOT_WRITTEN, text))
-        if not self._guard.is_listed():
+        if not self._guard.is_member():
             text = "its key is not in the fleet's list of members: nobody hears it"
             alarms.append(Reason(ReasonCode.NOT_A_MEMBER, text))
         if differ := self._guard.members_differ():
@@ -534,7 +534,7 @@ class RobotNode:
         robot_id = self._config.robot_id
         is_claimed = self._link is not None and self._link.is_claimed(robot_id)
         is_heard = self._pac.table.is_own_id_heard(self._ports.clock.monotonic_s())
-        return is_claimed or is_heard or robot_id in self._guard.robots_said_twice()
+        return is_claimed or is_heard or robot_id in self._guard.duplicate_robots()
 
 
 def _fields(value: RobotStatus | VehicleState | PolicyTick) -> dict[str, object]:

@@ -38,7 +38,7 @@ from edge.drivers.process_lock import ProcessLock
 from edge.drivers.registry import load_verified_policy, open_link, open_sensor, open_vehicle
 from edge.drivers.stop import Stop
 from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_text
-from edge.identity.group import MOST_BYTES, MOST_FRAGMENTS, frames, key_of_open_fleet
+from edge.identity.group import MOST_BYTES, MOST_FRAGMENTS, frames, open_fleet_key
 from edge.identity.guard import Unguarded
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import LoopStatus
@@ -194,7 +194,7 @@ def _group(config: RobotConfig, identity: Identity | None) -> Group | None:
     if not config.link.group:
         return None
     address, port = require_group("group", config.link.group)
-    open_key = key_of_open_fleet(config.fleet)
+    open_key = open_fleet_key(config.fleet)
 
     def keys() -> GroupKeys:
         if identity is None:

@@ -144,7 +144,7 @@ class Readiness:
         fell_silent: Sequence[Neighbour],
         duplicate: bool,
         watchdog_alive: bool,
-        is_listed: bool,
+        is_member: bool,
         members_differ: str,
         ground_age_s: float,
         time_uncertainty_s: float | None,
@@ -191,7 +191,7 @@ class Readiness:
         if not watchdog_alive:
             text = "watchdog has ended: start this robot's program again"
             failed = (*failed, FailedCheck(CheckCode.WATCHDOG_ENDED, text))
-        if not is_listed:
+        if not is_member:
             text = "its key is not in the fleet's list of members: enroll this robot again"
             failed = (*failed, FailedCheck(CheckCode.NOT_A_MEMBER, text))
         if members_differ:

@@ -8,7 +8,7 @@ import math
 import statistics
 from dataclasses import replace
 
-from edge.identity.guard import Speaker
+from edge.identity.guard import Sender
 from edge.identity.members import Role
 from edge.messages.mission import FlightState, GroundState, RobotStatus
 from lpac.analysis.commonest import commonest
@@ -149,9 +149,9 @@ class Election:
 
     # What it hears
 
-    def hear_state(self, state: GroundState, speaker: Speaker) -> None:
+    def hear_state(self, state: GroundState, sender: Sender) -> None:
         """Another station's state came. It counts if its operator's key signed it."""
-        if speaker.name not in ("", state.operator) or speaker.role is not Role.OPERATOR:
+        if sender.name not in ("", state.operator) or sender.role is not Role.OPERATOR:
             return
         before = self.state
         if state.operator == self._setup.operator:

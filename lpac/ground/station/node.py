@@ -13,7 +13,7 @@ from typing import Protocol
 
 from edge.core.memory import EXPLORED_CELLS
 from edge.core.ports import Clock
-from edge.identity.guard import Guard, Speaker
+from edge.identity.guard import Guard, Sender
 from edge.identity.members import Role
 from edge.messages.codec import MessageError, decode, encode
 from edge.messages.mission import GroundState, Hold, RobotStatus
@@ -91,7 +91,7 @@ class GroundNode:
 
     def attach(self, link: Link) -> None:
         """Set the link to publish on from now on."""
-        self._link = self._guard.over(link)
+        self._link = self._guard.wrap(link)
 
     def detach(self) -> None:
         """Publish nothing from now on."""
@@ -107,24 +107,24 @@ class GroundNode:
         """The fleet now."""
         return self.station.snapshot(self.commands.texts)
 
-    def _hear(self, key: str, data: bytes, speaker: Speaker) -> None:
+    def _hear(self, key: str, data: bytes, sender: Sender) -> None:
         self._set_time()
         with self.surviving(key):
-            self._receive(key, data, speaker)
+            self._receive(key, data, sender)
 
     def tick(self) -> None:
         """Time has passed; some five times a second."""
         self._set_time()
-        self.station.hear_twice(self._guard.robots_said_twice())
+        self.station.hear_twice(self._guard.duplicate_robots())
         self.station.members_problem = (
             self._guard.members_differ()
             if self.station.is_member
             else "this station's key is not in the list of members: no robot hears it"
         )
-        for robot_id in self._guard.robots_ahead():
+        for robot_id in self._guard.robots_with_future_start():
             name = self._names.get(f"robot/{robot_id}", "")
             self._complain(f"ahead {robot_id}", name, _AHEAD)
-        for robot_id in self._guard.take_strangers():
+        for robot_id in self._guard.pop_unreadable_robots():
             name = self._names.get(f"robot/{robot_id}", "")
             self._complain(f"stranger {robot_id}", name, _STRANGER)
         with self.surviving("tick"):
@@ -151,10 +151,10 @@ class GroundNode:
     def _set_time(self) -> None:
         unix_s = self._clock.unix_s()
         self.station.set_time(self._clock.monotonic_s(), unix_s)
-        self.station.is_member = self._guard.is_listed()
-        self._guard.hear_time(unix_s)
+        self.station.is_member = self._guard.is_member()
+        self._guard.receive_time(unix_s)
 
-    def _receive(self, key: str, data: bytes, speaker: Speaker) -> None:
+    def _receive(self, key: str, data: bytes, sender: Sender) -> None:
         source, _, topic = key.rpartition("/")
         name = self._names.get(source)
         if topic == EXPLORED.name:
@@ -165,9 +165,9 @@ class GroundNode:
             return
         try:
             if topic == STATE.name:
-                self.station.election.hear_state(decode(GroundState, data), speaker)
+                self.station.election.hear_state(decode(GroundState, data), sender)
             elif topic == HOLD.name:
-                self.station.hear_hold(decode(Hold, data), speaker)
+                self.station.hear_hold(decode(Hold, data), sender)
             elif topic == WORLD.name:
                 self.station.hear_world(data.decode(errors="replace"))
             else:
@@ -175,8 +175,8 @@ class GroundNode:
                 if source != f"robot/{status.robot_id}":
                     said = self._names.get(f"robot/{status.robot_id}", f"robot {status.robot_id}")
                     raise MessageError(f"it says that it is {said}")
-                is_own = speaker.release == self._guard.release
-                self.station.hear_status(status, "" if is_own else speaker.release.hex())
+                is_own = sender.release == self._guard.release
+                self.station.hear_status(status, "" if is_own else sender.release.hex())
         except MessageError as error:
             # Another version of the program, say.
             self._complain(key, name or "", f"{topic} is not understood: {error}")

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Collection
 from dataclasses import replace
 
-from edge.identity.guard import Speaker
+from edge.identity.guard import Sender
 from edge.messages.mission import (
     ON_GROUND,
     FlightState,
@@ -204,10 +204,10 @@ class Station:
         """Another station sends a world to the robots."""
         self.worlds.hear(text, self.setup.world_id)
 
-    def hear_hold(self, hold: Hold, speaker: Speaker) -> None:
+    def hear_hold(self, hold: Hold, sender: Sender) -> None:
         """Another station asks for a hold: the commander takes it up."""
         before = self.state
-        if not self.commands or before is None or speaker.name not in ("", hold.by):
+        if not self.commands or before is None or sender.name not in ("", hold.by):
             return
         if hold.by == self.operator or holds(before, hold):
             return

@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 
 from edge.drivers.identity_folder import load_identity
 from edge.drivers.zenoh_link import ZenohLink
-from edge.identity.guard import Guard, Speaker, Unguarded
+from edge.identity.guard import Guard, Sender, Unguarded
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import RobotStatus
 from edge.messages.topics import STATUS
@@ -102,7 +102,7 @@ class FleetListener:
                 self._changed.wait(min(left_s, _LOOK_AGAIN_S))
         return True
 
-    def _hear(self, _: str, data: bytes, __: Speaker) -> None:
+    def _hear(self, _: str, data: bytes, __: Sender) -> None:
         at_s = time.monotonic()
         try:
             status = decode(RobotStatus, data)

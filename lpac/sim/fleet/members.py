@@ -45,7 +45,7 @@ class SimulatedMembers:
     def _change(self, members: tuple[Member, ...]) -> None:
         self.list = replace(self.list, number=self.list.number + 1, members=members)
         for guard in self._guards:
-            guard.take(self.list)
+            guard.update_members(self.list)
 
     def _signer(self, whose: str) -> Signer:
         return Signer(hashlib.sha256(f"{self._fleet} {whose}".encode()).digest())

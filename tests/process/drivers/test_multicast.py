@@ -18,9 +18,9 @@ from edge.drivers.multicast import MulticastLink
 from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.envelope import HEAD_BYTES, Address, enclose, seal
 from edge.identity.group import PART_BYTES, GroupKey, datagrams
-from edge.identity.guard import Membership, SignedGuard, Speaker, Unguarded
+from edge.identity.guard import Membership, Sender, SignedGuard, Unguarded
 from edge.identity.members import Member, Members, Role
-from edge.identity.news import MessageNumber
+from edge.identity.replay_window import MessageNumber
 from edge.identity.signature import Signer
 from edge.messages.topics import MESSAGE, STATUS, Group, GroupKeys, Link, LinkSetting
 from lpac.sim.ports import free_ports
@@ -81,7 +81,7 @@ class Robot:
                 self.guard.subscriptions({MESSAGE: self._hear}), None, group,
             )
         )  # fmt: skip
-        self.link: Link = self.guard.over(self.radio)
+        self.link: Link = self.guard.wrap(self.radio)
 
     def __enter__(self) -> Self:
         return self
@@ -89,8 +89,8 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         self.radio.close()
 
-    def _hear(self, key: str, data: bytes, speaker: Speaker) -> None:
-        self.heard[speaker.name] = data
+    def _hear(self, key: str, data: bytes, sender: Sender) -> None:
+        self.heard[sender.name] = data
         self.all_heard.append(data)
         self.heard_at_s.append(time.monotonic())
 
@@ -183,7 +183,7 @@ def test_of_two_programs_without_keys_each_hears_that_the_other_has_its_id(group
 
         def speak(*links: MulticastLink) -> None:
             for guard, link in zip(guards, links, strict=False):
-                guard.over(link).publish(MESSAGE, b"here")
+                guard.wrap(link).publish(MESSAGE, b"here")
 
         def silent_hears() -> bool:
             speak(first)
@@ -242,7 +242,7 @@ def test_no_robot_hears_its_own_words_when_a_stranger_says_them_again(group: Gro
             for data in list(recorded):
                 someone.sendto(data, (group.address, group.port))
             eventually_hear(second, b"after all that", first)
-            assert "r1" not in first.heard and not first.guard.robots_said_twice()
+            assert "r1" not in first.heard and not first.guard.duplicate_robots()
 
 
 def test_a_member_cannot_speak_for_another_nor_make_it_old(group: Group) -> None:
@@ -275,7 +275,7 @@ def test_a_member_cannot_speak_for_another_nor_make_it_old(group: Group) -> None
 def test_one_packet_with_a_stolen_key_mutes_no_robot_for_good(group: Group) -> None:
     now_ms = int(1e3 * time.time())
     with Robot(group, 2) as second, stranger() as thief:
-        second.guard.hear_time(time.time())
+        second.guard.receive_time(time.time())
 
         def stolen(start: int) -> bytes:
             said = seal(
@@ -331,7 +331,7 @@ def test_no_forged_message_keeps_a_robots_own_from_being_heard(group: Group, key
 def test_a_stolen_robots_key_does_not_keep_the_new_one_from_being_heard(group: Group) -> None:
     """The robot was enrolled anew; the thief has its former key, and the group's."""
     with Robot(group, 2) as second, stranger() as thief:
-        second.guard.take(members(enrolled=2))
+        second.guard.update_members(members(enrolled=2))
         datagram = said_by_thief(signer_of(1), signer_of(1), FORMER)
 
         def refused() -> bool:

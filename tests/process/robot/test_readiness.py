@@ -59,7 +59,7 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
         "fell_silent": (),
         "duplicate": False,
         "watchdog_alive": True,
-        "is_listed": True,
+        "is_member": True,
         "members_differ": "",
         "ground_age_s": 0.1,
         "time_uncertainty_s": 0.01,
@@ -206,7 +206,7 @@ def test_a_look_that_fails_before_arming_ends_no_watch(
     [
         ({"watchdog_alive": False}, CheckCode.WATCHDOG_ENDED),
         ({"duplicate": True}, CheckCode.DUPLICATE_ID),
-        ({"is_listed": False}, CheckCode.NOT_A_MEMBER),
+        ({"is_member": False}, CheckCode.NOT_A_MEMBER),
         ({"members_differ": "r2 has list 8"}, CheckCode.MEMBERS_DIFFER),
         ({"ground_age_s": float("inf")}, CheckCode.GROUND_NOT_HEARD),
         ({"ground_age_s": 9.0}, CheckCode.GROUND_SILENT),

@@ -23,7 +23,7 @@ from edge.core.world import format_world, random_features
 from edge.drivers.flight_log import read as read_log
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.failsafe import PARAMETERS
-from edge.identity.guard import Speaker, Unguarded
+from edge.identity.guard import Sender, Unguarded
 from edge.messages.codes import CheckCode, ReasonCode, RefusalCode, texts
 from edge.messages.mission import (
     FlightState,
@@ -281,7 +281,7 @@ def keeps_what_it_has_in_flight(made: Rig, eve: RawGround) -> None:
 def listening(made: Rig, explored: list[int]) -> Iterator[None]:
     """Meanwhile it is kept how many cells the robot says it has seen."""
 
-    def count(_: str, data: bytes, __: Speaker) -> None:
+    def count(_: str, data: bytes, __: Sender) -> None:
         explored.append(int(explored_from_bytes(data).sum()))
 
     with ZenohLink(

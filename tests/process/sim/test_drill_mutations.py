@@ -16,7 +16,7 @@ from edge.core.logger import errors_only
 from edge.flight.orders import ORDERS
 from edge.flight.state import Robot
 from edge.flight.transitions import TRANSITIONS, Transition, by_state
-from edge.identity.news import NOTHING, MessageNumber, Newest
+from edge.identity.replay_window import NO_NUMBER, MessageNumber, ReplayWindow
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
 from lpac.ground.station.station import Station
@@ -127,15 +127,15 @@ def ground_tells_nothing_of_holds(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def a_program_that_starts_again_is_not_heard(monkeypatch: pytest.MonkeyPatch) -> None:
-    is_older = Newest.is_older
+    is_replay = ReplayWindow.is_replay
 
     def of_another_start(
-        self: Newest, number: MessageNumber, now_s: float, unix_s: float | None
+        self: ReplayWindow, number: MessageNumber, now_s: float, unix_s: float | None
     ) -> bool:
-        started_again = self.number is not NOTHING and number.start != self.number.start
-        return started_again or is_older(self, number, now_s, unix_s)
+        started_again = self.number is not NO_NUMBER and number.start != self.number.start
+        return started_again or is_replay(self, number, now_s, unix_s)
 
-    monkeypatch.setattr(Newest, "is_older", of_another_start)
+    monkeypatch.setattr(ReplayWindow, "is_replay", of_another_start)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
 from edge.core.wire import Rejection, decode, encode
 from edge.drivers.registry import load_policy
-from edge.identity.guard import Speaker
+from edge.identity.guard import Sender
 from edge.identity.members import Role
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon
 from edge.messages.mission import FlightState, RobotStatus
@@ -103,10 +103,10 @@ class Thief:
             Role.ROBOT, self.name, self._robot_id, _START, clock.monotonic_s
         )
         link = fleet.radio.link(self._robot_id, guard.subscriptions({MESSAGE: self._hear}))
-        self._link = guard.over(link)
+        self._link = guard.wrap(link)
         clock.every(1.0 / _LIES_HZ, self._speak)
 
-    def _hear(self, key: str, data: bytes, __: Speaker) -> None:
+    def _hear(self, key: str, data: bytes, __: Sender) -> None:
         beacon = decode_beacon(data, int(key.split("/")[1]))
         message = decode(data[BEACON_BYTES:], message_size=self._policy.message_size)
         if isinstance(message, Rejection):

@@ -48,7 +48,7 @@ def test_who_is_no_member_sets_nobody_in_motion(
 ) -> None:
     field = a_field(1, "ready")
     guard = field.fleet.grounds["alice"].node._guard
-    monkeypatch.setattr(type(guard), "is_listed", lambda *_: False)
+    monkeypatch.setattr(type(guard), "is_member", lambda *_: False)
     report = field.do(request_)
     assert problem(report) is ProblemCode.MAY_NOT
     assert report.problem is not None

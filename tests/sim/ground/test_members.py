@@ -52,7 +52,7 @@ def test_robots_whose_lists_differ_do_not_take_off_until_all_have_one() -> None:
     assert AlarmCode.MEMBERS_DIFFER not in alarms_at(field)
     later = a_later_list(field)
     first, second = field.robots
-    guard_of(first).take(later)
+    guard_of(first).update_members(later)
     field.run(3.0)
     # From the ground's, and from a neighbour's.
     number = later.number
@@ -69,7 +69,7 @@ def test_robots_whose_lists_differ_do_not_take_off_until_all_have_one() -> None:
     ground = field.fleet.grounds["alice"].node._guard
     for guard in (ground, guard_of(second)):
         assert isinstance(guard, SignedGuard)
-        guard.take(later)
+        guard.update_members(later)
     field.run(6.0)
     assert not any(failed(robot) for robot in field.robots)
     assert AlarmCode.MEMBERS_DIFFER not in alarms_at(field)
@@ -79,7 +79,7 @@ def test_robots_whose_lists_differ_do_not_take_off_until_all_have_one() -> None:
 def test_in_flight_another_list_changes_nothing_and_is_told() -> None:
     field = a_field(2, "flying", secure=True)
     first, second = field.robots
-    guard_of(first).take(a_later_list(field))
+    guard_of(first).update_members(a_later_list(field))
     field.run(6.0)
     assert field.states() == {FlightState.MISSION}
     assert [set(status_of(robot).neighbour_ages_s) for robot in field.robots] == [{"1"}, {"0"}]
@@ -114,5 +114,5 @@ def test_a_program_that_starts_again_is_heard_at_once(starts: str) -> None:
         assert isinstance(ground, SignedGuard)
         field.run(0.1)
         heard_s = field.now_s
-        field.until(lambda: ground._heard[key].newest_s >= heard_s, 1.0)
+        field.until(lambda: ground._streams[key].newest_s >= heard_s, 1.0)
         assert "unknown_key" not in status_of(first).message_counts

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.identity.guard import Speaker, Unguarded
+from edge.identity.guard import Sender, Unguarded
 from edge.identity.members import Role
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, GroundState, Place, world_id
@@ -41,7 +41,7 @@ from tests.said import not_done, problem
 from tests.sim.ground.field import Field, a_field
 from tests.unit.ground.snapshots import on_ground, setup, status
 
-ANYBODY = Speaker(Role.OPERATOR, "")
+ANYBODY = Sender(Role.OPERATOR, "")
 
 _S = FlightState
 OTHER_WORLD = "CircularBND 100 100 20 5\n"

@@ -32,7 +32,7 @@ from edge.core.world import random_features, rasterize
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
 from edge.flight.state import FlightInputs
-from edge.identity.guard import Speaker
+from edge.identity.guard import Sender
 from edge.identity.members import Role
 from edge.messages.beacon import Beacon, Neighbour
 from edge.messages.codec import encode
@@ -63,7 +63,7 @@ from tests.robot_rig import ORIGIN, new_vehicle, write_config
 from tests.said import checks, codes, why
 from tests.unit.flight.test_preflight import NEIGHBOUR
 
-ANYBODY = Speaker(Role.OPERATOR, "")
+ANYBODY = Sender(Role.OPERATOR, "")
 
 FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 28.0)
 PLACE = Place(slot=1, landing_point_m=(14.0, 12.0))

@@ -42,7 +42,7 @@ def test_a_member_is_who_the_authority_says(authority: Authority, tmp_path: Path
     authority.revoke("r3")
     give_list(authority, folder)
     identity = load_identity(folder, fleet="demo", unix_s=2e9, robot_id=3)
-    assert not identity.guard(lambda: 0.0).is_listed()
+    assert not identity.guard(lambda: 0.0).is_member()
     with pytest.raises(ConfigError, match="its key is not in the list of members"):
         load_identity(folder, fleet="demo", unix_s=2e9)
 

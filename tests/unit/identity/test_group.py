@@ -15,10 +15,10 @@ from edge.identity.group import (
     GroupKey,
     datagrams,
     frames,
-    key_of_open_fleet,
     open_datagram,
+    open_fleet_key,
 )
-from edge.identity.news import NOTHING, MessageNumber
+from edge.identity.replay_window import NO_NUMBER, MessageNumber
 
 KEY, FORMER, ANOTHER = (GroupKey.of(bytes([n]) * 32) for n in range(3))
 numbers = st.builds(MessageNumber, st.integers(0, 2**48 - 1), st.integers(0, 2**32 - 1))
@@ -49,7 +49,7 @@ def put_together(assembly: Assembly, pieces: Sequence[bytes], *, heard: bool = T
         if message is not None:
             payloads.append(message[HEAD_BYTES:])
             if heard:
-                assembly.heard(fragment, 0.0)
+                assembly.confirm(fragment, 0.0)
     return payloads
 
 
@@ -153,7 +153,7 @@ def test_an_open_fleets_robot_may_come_back_with_an_earlier_clock() -> None:
         assert fragment is not None
         if assembly.add(fragment, now_s) is None:
             return False
-        assembly.heard(fragment, now_s)
+        assembly.confirm(fragment, now_s)
         return True
 
     for forget_after_s, comes in ((5.0, True), (float("inf"), False)):
@@ -167,7 +167,7 @@ def test_of_an_envelope_of_another_version_the_sender_is_known() -> None:
     (datagram,) = datagrams(b"LE\xff" + bytes(HEAD_BYTES), sender=7, key=KEY)
     fragment = open_datagram(datagram, (KEY,))
     assert fragment is not None
-    assert (fragment.sender, fragment.number) == (7, NOTHING)
+    assert (fragment.sender, fragment.number) == (7, NO_NUMBER)
     assert is_of_other_version(fragment.head)
 
 
@@ -180,5 +180,5 @@ def test_what_has_no_envelope_does_not_come_through() -> None:
 def test_a_key_is_32_bytes_and_fleets_without_keys_are_kept_apart() -> None:
     with pytest.raises(ValueError, match="a group key has 5 bytes: must be 32"):
         GroupKey.of(b"short")
-    field, other = (GroupKey.of(key_of_open_fleet(fleet)) for fleet in ("field", "other"))
+    field, other = (GroupKey.of(open_fleet_key(fleet)) for fleet in ("field", "other"))
     assert open_datagram(sent(b"hello", key=field)[0], (other,)) is None

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.identity.envelope import OVERHEAD_BYTES
-from edge.identity.guard import Membership, SignedGuard, Speaker, Unguarded
+from edge.identity.guard import Membership, Sender, SignedGuard, Unguarded
 from edge.identity.members import Member as Listed
 from edge.identity.members import Members, MembersError, Role
-from edge.identity.news import MessageNumber
+from edge.identity.replay_window import MessageNumber
 from edge.identity.signature import Signer
 from edge.messages.topics import HOLD, MESSAGE, ORDER, STATE, STATUS, ReceiveCallback, Topic
 
@@ -47,7 +47,7 @@ class Member:
         self.own = own
         membership = Membership(own, signer(own.name), list_ or members(), start)
         self.guard = SignedGuard(membership, lambda: self.now_s)
-        self.heard: list[tuple[str, bytes, Speaker]] = []
+        self.heard: list[tuple[str, bytes, Sender]] = []
         topics: Mapping[Topic, ReceiveCallback] = self.guard.subscriptions(
             dict.fromkeys(
                 (MESSAGE, STATUS, STATE, HOLD, ORDER), lambda *said: self.heard.append(said)
@@ -55,7 +55,7 @@ class Member:
         )
         self._topics = topics
         self.sent: list[tuple[Topic, bytes]] = []
-        self._link = self.guard.over(self)
+        self._link = self.guard.wrap(self)
 
     def publish(self, topic: Topic, data: bytes) -> None:
         self.sent.append((topic, data))
@@ -113,7 +113,7 @@ def test_a_program_is_heard_with_its_first_message(one: Member, two: Member) -> 
     one.hear(two, sent)
     number, digest = MessageNumber(1, 1), members().digest
     assert one.heard == [
-        ("robot/2/message", b"hello", Speaker(Role.ROBOT, "r2", number, members=digest))
+        ("robot/2/message", b"hello", Sender(Role.ROBOT, "r2", number, members=digest))
     ]
     # Also of its next start, and a ground's.
     for again, says in ((robot(2, start=2), MESSAGE), (operator(), STATE), (operator(2), STATE)):
@@ -129,7 +129,7 @@ def test_its_own_words_are_no_news_whoever_says_them_again(start: int) -> None:
         one.now_s = float(second)
         ((_, said),) = former.say(MESSAGE, b"")[-1:]
         assert not one.takes(MESSAGE, "robot/1/message", said)
-    assert not one.heard and not one.guard.robots_said_twice()
+    assert not one.heard and not one.guard.duplicate_robots()
     # Another program with its key that began later is heard.
     ((_, said),) = robot(1, start=6).say(MESSAGE, b"another")[-1:]
     assert one.takes(MESSAGE, "robot/1/message", said)
@@ -180,17 +180,17 @@ def test_two_programs_with_one_key_are_told_from_a_new_start(one: Member, two: M
 
     # What was on its way when the program started again, and then a second program.
     both_speak(4.0)
-    assert one.guard.robots_said_twice() == Unguarded(1).robots_said_twice() == set()
+    assert one.guard.duplicate_robots() == Unguarded(1).duplicate_robots() == set()
     both_speak(8.0)
-    assert one.guard.robots_said_twice() == {2}
+    assert one.guard.duplicate_robots() == {2}
     one.now_s += 6.0
-    assert one.guard.robots_said_twice() == set()
+    assert one.guard.duplicate_robots() == set()
     # One and the same message over and over is no program.
     ((_, data),) = two.say(MESSAGE, b"once")[-1:]
     for _ in range(20):
         one.now_s += 0.5
         assert not one.takes(MESSAGE, "robot/2/message", data)
-    assert one.guard.robots_said_twice() == set()
+    assert one.guard.duplicate_robots() == set()
 
 
 def test_a_robots_key_is_no_operators_and_no_other_robots(one: Member, two: Member) -> None:
@@ -209,7 +209,7 @@ def test_an_observer_says_a_hold_and_nothing_else(one: Member) -> None:
     for member, heard in ((observer, [True, False, False]), (operator(), [True, True, True])):
         said = [(topic, *member.say(topic, b"other")[0][1:]) for topic in (HOLD, ORDER, STATE)]
         assert [one.takes(t, member.key(t), data) for t, data in said] == heard
-    assert [(speaker.role, speaker.name) for *_, speaker in one.heard] == [
+    assert [(sender.role, sender.name) for *_, sender in one.heard] == [
         (Role.OBSERVER, "guest"),
         *[(Role.OPERATOR, "ann")] * 3,
     ]
@@ -223,16 +223,16 @@ def test_another_fleet_is_not_heard_even_of_the_same_name_and_key(one: Member) -
 
 def test_who_is_not_in_the_list_is_not_heard(one: Member, two: Member) -> None:
     one.hear(two, two.say(MESSAGE, b"1"))
-    one.guard.take(members(2, without="r2"))
+    one.guard.update_members(members(2, without="r2"))
     assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"2"))
     assert one.guard.refused() == {"unknown_key": 1}
     # It may still be there; and one that has the list knows why nobody listens.
-    assert one.guard.revoked_robots() == {2} and one.guard.is_listed()
-    assert two.guard.is_listed() and Unguarded(1).is_listed()
-    two.guard.take(members(2, without="r2"))
-    assert not two.guard.is_listed() and two.guard.revoked_robots() == {2}
+    assert one.guard.revoked_robots() == {2} and one.guard.is_member()
+    assert two.guard.is_member() and Unguarded(1).is_member()
+    two.guard.update_members(members(2, without="r2"))
+    assert not two.guard.is_member() and two.guard.revoked_robots() == {2}
     # Whoever comes back is heard; what it said before is over.
-    one.guard.take(members(3))
+    one.guard.update_members(members(3))
     assert one.guard.revoked_robots() == Unguarded(1).revoked_robots() == set()
     assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"3"))
 
@@ -241,12 +241,12 @@ def test_who_was_replaced_is_not_heard_any_more(one: Member, two: Member) -> Non
     swapped = listed(Role.ROBOT, "spare", 2)
     others = tuple(member for member in ALL if member.robot_id != 2)
     later = replace(members(2), members=(*others, swapped))
-    one.guard.take(later)
-    two.guard.take(later)
+    one.guard.update_members(later)
+    two.guard.update_members(later)
     new = Member(swapped, list_=later)
     assert one.takes(MESSAGE, "robot/2/message", new.guard.seal(MESSAGE, b"I am two"))
     assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"so am I"))
-    assert new.guard.is_listed() and not two.guard.is_listed()
+    assert new.guard.is_member() and not two.guard.is_member()
     assert one.guard.revoked_robots() == set()
 
 
@@ -262,10 +262,10 @@ def test_who_was_replaced_is_not_heard_any_more(one: Member, two: Member) -> Non
 def test_a_list_that_is_older_or_another_fleets_is_not_taken(
     one: Member, other: Members, problem: str
 ) -> None:
-    one.guard.take(members(2))
-    one.guard.take(members(2))
+    one.guard.update_members(members(2))
+    one.guard.update_members(members(2))
     with pytest.raises(MembersError, match=problem):
-        one.guard.take(other)
+        one.guard.update_members(other)
     assert one.guard.members == members(2)
 
 
@@ -278,21 +278,21 @@ def test_who_has_another_list_is_named_while_it_is_heard(one: Member, two: Membe
         return one.guard.members_differ()
 
     assert both_speak() == Unguarded(1).members_differ() == ""
-    ground.guard.take(members(2))
+    ground.guard.update_members(members(2))
     assert both_speak() == (
         "the list of members here is 1, and ann has 2, which is newer: run `lpac fleet up`"
     )
-    two.guard.take(members(2))
-    one.guard.take(members(3))
+    two.guard.update_members(members(2))
+    one.guard.update_members(members(3))
     assert "is 3, and r2 has 2, which is older, ann has 2, which is older:" in both_speak()
-    two.guard.take(members(3, without="r4"))
-    ground.guard.take(members(3))
+    two.guard.update_members(members(3, without="r4"))
+    ground.guard.update_members(members(3))
     assert "is 3, and r2 has another 3:" in both_speak()
     # What it said before on another topic does not count, nor what it said long ago.
     one.hear(two, two.say(STATUS, b""))
     one.now_s = 4.0
-    two.guard.take(members(4))
-    one.guard.take(members(4))
+    two.guard.update_members(members(4))
+    one.guard.update_members(members(4))
     one.hear(two, two.say(MESSAGE, b""))
     assert "ann has 3" in one.guard.members_differ() and "r2" not in one.guard.members_differ()
     one.now_s = 9.5
@@ -300,14 +300,14 @@ def test_who_has_another_list_is_named_while_it_is_heard(one: Member, two: Membe
 
 
 def test_without_a_guard_a_message_is_its_keys() -> None:
-    heard: list[tuple[str, bytes, Speaker]] = []
+    heard: list[tuple[str, bytes, Sender]] = []
     guard = Unguarded(5)
     topics = guard.subscriptions(dict.fromkeys((MESSAGE, STATE), lambda *said: heard.append(said)))
     assert topics[MESSAGE]("robot/3/message", guard.seal(MESSAGE, b"m"))
     assert topics[STATE]("ground/state", guard.seal(STATE, b"s"))
     assert heard == [
-        ("robot/3/message", b"m", Speaker(Role.ROBOT, "", MessageNumber(5, 1))),
-        ("ground/state", b"s", Speaker(Role.OPERATOR, "", MessageNumber(5, 1))),
+        ("robot/3/message", b"m", Sender(Role.ROBOT, "", MessageNumber(5, 1))),
+        ("ground/state", b"s", Sender(Role.OPERATOR, "", MessageNumber(5, 1))),
     ]
     # What is not in an envelope, or in a member's.
     for data in (b"m", robot(3).guard.seal(MESSAGE, b"m")):
@@ -339,7 +339,7 @@ def thief(robot_id: int, ahead_ms: float, sequence: int = 2**32 - 1) -> Member:
 
 def speak(
     hearer: Member, member: Member, until_s: float, topic: Topic = MESSAGE
-) -> list[tuple[str, bytes, Speaker]]:
+) -> list[tuple[str, bytes, Sender]]:
     """Return what is heard of a member that speaks at 4 Hz."""
     before = len(hearer.heard)
     while hearer.now_s < until_s:
@@ -355,28 +355,28 @@ def packet(member: Member, topic: Topic = MESSAGE) -> list[tuple[Topic, bytes]]:
 
 @pytest.mark.parametrize("topic", [MESSAGE, STATUS])
 def test_no_start_beyond_a_day_mutes_a_robot(one: Member, topic: Topic) -> None:
-    one.guard.hear_time(NOW_S)
+    one.guard.receive_time(NOW_S)
     two, enemy = begun(2, -60.0), thief(2, 2**48 if topic is MESSAGE else 1.1 * DAY_MS)
     assert speak(one, two, 5.0, topic)
     one.hear(enemy, packet(enemy, topic))
     assert one.guard.refused()["start_ahead"] == 1
     assert len(speak(one, two, 6.0, topic)) == 4
     # And the operator is told: while the real one is heard, its key is somebody else's too.
-    assert one.guard.robots_said_twice() == one.guard.robots_ahead() == {2}
+    assert one.guard.duplicate_robots() == one.guard.robots_with_future_start() == {2}
     speak(one, two, 20.0, topic)
-    assert one.guard.robots_said_twice() == one.guard.robots_ahead() == set()
+    assert one.guard.duplicate_robots() == one.guard.robots_with_future_start() == set()
 
 
 @pytest.mark.parametrize("ahead_ms", [-60e3, 0.9 * DAY_MS], ids=["its own start", "a later one"])
 def test_whom_a_thief_silenced_is_heard_again_once_it_starts_again(
     one: Member, ahead_ms: float
 ) -> None:
-    one.guard.hear_time(NOW_S)
+    one.guard.receive_time(NOW_S)
     two, enemy = begun(2, -60.0), thief(2, ahead_ms)
     assert speak(one, two, 5.0)
     one.hear(enemy, stolen := packet(enemy))
     speak(one, two, 12.0)
-    assert one.guard.robots_said_twice() == {2}, "and others say so"
+    assert one.guard.duplicate_robots() == {2}, "and others say so"
     again = begun(2, 13.0)
     assert len(speak(one, again, 20.0)) == 32
     # What the thief said is over, and so is what the robot said before.
@@ -393,21 +393,21 @@ def test_a_start_that_was_heard_before_the_time_was_known_mutes_nobody_for_good(
     assert speak(one, two, 1.0)
     one.hear(enemy, packet(enemy))
     assert not speak(one, two, 3.0)
-    one.guard.hear_time(NOW_S + 3.0)
+    one.guard.receive_time(NOW_S + 3.0)
     assert speak(one, begun(2, 4.0), 5.0)
 
 
 def test_a_clock_that_is_set_back_makes_nobody_deaf_in_flight(one: Member) -> None:
-    one.guard.hear_time(NOW_S)
+    one.guard.receive_time(NOW_S)
     two = begun(2, -60.0)
     assert speak(one, two, 1.0)
-    one.guard.hear_time(NOW_S - 30 * 86_400.0)
-    assert len(speak(one, two, 2.0)) == 4 and not one.guard.robots_ahead()
+    one.guard.receive_time(NOW_S - 30 * 86_400.0)
+    assert len(speak(one, two, 2.0)) == 4 and not one.guard.robots_with_future_start()
 
 
 def test_a_ground_is_heard_whatever_its_clock_was(one: Member) -> None:
     """Robots in flight hear their ground, though its laptop's clock was wrong once."""
-    one.guard.hear_time(NOW_S)
+    one.guard.receive_time(NOW_S)
     ground = operator(int(1e3 * NOW_S + 30 * DAY_MS))
     assert speak(one, ground, 1.0, STATE)
     # Its clock was set right, and it started again.
@@ -423,14 +423,14 @@ def test_messages_that_overtake_each_other_are_no_second_program(one: Member, tw
         one.hear(two, [*packet(two), *late, *late])
         late = said
     assert one.guard.refused()["replayed"] > 100
-    assert one.guard.robots_said_twice() == set()
+    assert one.guard.duplicate_robots() == set()
 
 
 def test_a_robot_hears_that_another_has_its_key(one: Member) -> None:
     one.hear(robot(2), packet(robot(2)))
     enemy = robot(1, start=2)
     one.hear(enemy, packet(enemy))
-    assert one.guard.robots_said_twice() == {1}
+    assert one.guard.duplicate_robots() == {1}
 
 
 PLACE = "192.0.2.1:7447"
@@ -453,7 +453,7 @@ def test_a_knock_counts_once_and_of_members_alone(one: Member) -> None:
     stranger = robot(2, list_=members(authority=OTHER_FLEET))
     assert not one.guard.is_knock(stranger.guard.knock(PLACE), PLACE)
     assert not one.guard.is_knock(robot(3).guard._seal(f"robot/2/knock/{PLACE}", b""), PLACE)
-    one.guard.take(members(2, without="r2"))
+    one.guard.update_members(members(2, without="r2"))
     assert not one.guard.is_knock(two.guard.knock(PLACE), PLACE)
 
 
@@ -469,7 +469,7 @@ def test_a_key_that_is_no_robots_is_refused(robot: str) -> None:
     subscriptions = guard.subscriptions({MESSAGE: lambda *said: heard.append(said)})
     for data in (guard.seal(MESSAGE, b"hi"), b"LE\xff"):
         assert subscriptions[MESSAGE](f"robot/{robot}/message", data) is False
-    assert not heard and not guard.take_strangers()
+    assert not heard and not guard.pop_unreadable_robots()
     assert subscriptions[MESSAGE]("robot/65535/message", guard.seal(MESSAGE, b"hi"))
     assert subscriptions[MESSAGE]("robot/3/message", b"LE\xff") is False
-    assert len(heard) == 1 and guard.take_strangers() == {3}
+    assert len(heard) == 1 and guard.pop_unreadable_robots() == {3}

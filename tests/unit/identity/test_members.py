@@ -63,5 +63,5 @@ def test_one_place_and_one_key_have_one_member() -> None:
         Members("demo", 1, b"a" * 32, (R3, Member(Role.ROBOT, "spare", 3, b"d" * 32)))
     with pytest.raises(MembersError, match="two have one key"):
         Members("demo", 1, b"a" * 32, (R3, Member(Role.ROBOT, "r4", 4, R3.public_key)))
-    with pytest.raises(ValueError, match="a robot has one, and nobody else"):
+    with pytest.raises(ValueError, match="robots alone must have one"):
         Member(Role.ROBOT, "r1", None, b"k" * 32)

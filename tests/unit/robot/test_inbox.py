@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from edge.identity.guard import Speaker
+from edge.identity.guard import Sender
 from edge.identity.members import Role
 from edge.messages.codec import encode
 from edge.messages.mission import Echo, GroundState, Hold, Order, Origin
@@ -17,7 +17,7 @@ from edge.robot.inbox import Inbox
 from edge.robot.neighbours import NeighbourTable
 from tests.unit.flight.test_preflight import NEIGHBOUR
 
-ANYBODY = Speaker(Role.OPERATOR, "")
+ANYBODY = Sender(Role.OPERATOR, "")
 
 STATE = GroundState(sequence=5, operator="anna", origin=Origin(40.0, -75.0, 30.0), enabled=True)
 ORDER = Order("a", 3, 77, "takeoff", 12.0, "anna")
@@ -172,13 +172,13 @@ def test_of_another_release_an_order_is_taken_as_far_as_it_is_understood() -> No
 
 def test_the_grounds_release_is_that_of_the_state_that_counts() -> None:
     inbox, other = make_inbox(), structs.replace(ANYBODY, release=b"abcd")
-    for now_s, data, speaker, release in (
+    for now_s, data, sender, release in (
         (1.0, encode(STATE), other, "61626364"),
         (1.5, encode(dataclasses.replace(STATE, sequence=4)), ANYBODY, "61626364"),
         (2.0, encode(STATE), ANYBODY, ""),
         (2.5, newer(STATE), other, "61626364"),
     ):
-        inbox.put_ground(data, speaker, now_s)
+        inbox.put_ground(data, sender, now_s)
         inbox.ground(now_s)
         assert inbox.other_release == release
 
@@ -223,8 +223,8 @@ def test_whom_the_ground_hears_and_this_robot_does_not() -> None:
 
 
 def test_of_who_does_not_command_only_a_hold_counts() -> None:
-    ann, bob = Speaker(Role.OPERATOR, "ann"), Speaker(Role.OPERATOR, "bob")
-    guest = Speaker(Role.OBSERVER, "guest")
+    ann, bob = Sender(Role.OPERATOR, "ann"), Sender(Role.OPERATOR, "bob")
+    guest = Sender(Role.OBSERVER, "guest")
     state = dataclasses.replace(STATE, operator="ann", safety_action="none")
 
     def asked(inbox: Inbox, now_s: float) -> tuple[str, str]:
@@ -238,23 +238,23 @@ def test_of_who_does_not_command_only_a_hold_counts() -> None:
         inbox.put_ground(encode(state), ann, 0.9)
         return inbox
 
-    for speaker in (bob, guest):
-        for hold in (Hold(speaker.name), Hold(speaker.name, (2, 3))):
+    for sender in (bob, guest):
+        for hold in (Hold(sender.name), Hold(sender.name, (2, 3))):
             inbox = make()
-            inbox.put_hold(encode(hold), speaker, 0.95)
-            assert asked(inbox, 1.0) == ("hold", speaker.name)
+            inbox.put_hold(encode(hold), sender, 0.95)
+            assert asked(inbox, 1.0) == ("hold", sender.name)
             # It ends with whoever says it.
-            assert asked(inbox, 2.4) == ("hold", speaker.name)
+            assert asked(inbox, 2.4) == ("hold", sender.name)
             assert asked(inbox, 2.5) == ("none", "")
         # Of others, in another's name, and a state that is not its operator's own.
         inbox = make()
-        inbox.put_hold(encode(Hold(speaker.name, (4,))), speaker, 0.95)
-        inbox.put_hold(encode(Hold("eve")), speaker, 0.95)
-        inbox.put_hold(b"{}", speaker, 0.95)
+        inbox.put_hold(encode(Hold(sender.name, (4,))), sender, 0.95)
+        inbox.put_hold(encode(Hold("eve")), sender, 0.95)
+        inbox.put_hold(b"{}", sender, 0.95)
         for action in ("hold", "land"):
             other = dataclasses.replace(state, sequence=state.sequence + 1, safety_action=action)
-            inbox.put_ground(encode(other), speaker, 0.95)
-            inbox.put_ground(newer(other), speaker, 0.95)
+            inbox.put_ground(encode(other), sender, 0.95)
+            inbox.put_ground(newer(other), sender, 0.95)
         assert asked(inbox, 1.0) == ("none", "")
         assert inbox.safety_request(1.0) == "none"
     # What the commander asks for goes before.
@@ -271,8 +271,8 @@ def test_an_order_is_its_operators_own() -> None:
     order = dataclasses.replace(ORDER, robot_id=3, operator="ann")
     for kind in ("takeoff", "kill"):
         data = encode(dataclasses.replace(order, kind=kind))
-        inbox.put_order(data, Speaker(Role.OPERATOR, "bob"), 0.0)
-        inbox.put_order(data, Speaker(Role.OBSERVER, "ann"), 0.0)
+        inbox.put_order(data, Sender(Role.OPERATOR, "bob"), 0.0)
+        inbox.put_order(data, Sender(Role.OBSERVER, "ann"), 0.0)
         assert inbox.order(0.0) is None
-        inbox.put_order(data, Speaker(Role.OPERATOR, "ann"), 0.0)
+        inbox.put_order(data, Sender(Role.OPERATOR, "ann"), 0.0)
         assert inbox.order(0.0) == dataclasses.replace(order, kind=kind)
