@@ -172,6 +172,7 @@ class Election:
 
     def hear_status(self, status: RobotStatus) -> None:
         """A robot may obey what this station does not know of: its former life, or another one."""
+        self.listen()
         state = self.state
         obeyed = status.obeyed_sequence, status.operator
         # Who obeys a station that is gone does so no longer than it takes to hear this one.

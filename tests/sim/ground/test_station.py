@@ -706,6 +706,39 @@ def test_robots_that_are_heard_late_are_taken_up_too() -> None:
     assert field.states() == {_S.MISSION}
 
 
+def test_a_station_that_starts_again_goes_on_once_most_robots_are_heard() -> None:
+    field = a_field(3, "flying")
+    again = field.restart("alice", away_s=0.1)
+    field.run(0.6)
+    assert again.commands
+    field.run(5.0)
+    assert field.states() == {_S.MISSION}
+
+
+def test_one_robot_that_is_cut_off_hastens_no_station() -> None:
+    field = a_field(3, "flying")
+    field.cut(("r0",), ("alice", "r1", "r2"))
+    field.run(1.5)
+    carol = field.join("carol")
+    field.cut(("r0", "carol"), ("alice", "r1", "r2"))
+    field.run(0.6)
+    assert carol.election.commander == "alice" and not carol.commands
+
+
+def test_one_robot_that_obeys_a_former_commander_hastens_it_neither() -> None:
+    field = a_field(3, "flying")
+    field.join("bob")
+    field.run(1.0)
+    field.done(SafetyCommand("hold"), by="bob")
+    field.cut(("r0",), ("alice", "bob", "r1", "r2"))
+    field.done(Resume(("r1", "r2")), by="alice")
+    field.leave("bob")
+    again = field.restart("bob", away_s=0.1)
+    field.cut(("r0", "bob"), ("alice", "r1", "r2"))
+    field.run(0.6)
+    assert not again.commands
+
+
 def test_another_station_takes_up_what_was_left_alone() -> None:
     field = a_field(2, "flying")
     field.leave("alice")
