@@ -2,7 +2,7 @@
 
     python -m tests.record_flights [NAME...]
 
-Each is one robot's, cut to what matters: a normal flight, and what docs/safety.md lists as failing,
+Each is one robot's, cut to what matters: a normal flight, and what docs/faults.md lists as failing,
 flown on the simulated clock. To record a flight anew is to accept that it is now decided otherwise;
 `lpac replay tests/unit/flight/recorded` shows before, what is.
 """

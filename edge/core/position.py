@@ -4,7 +4,7 @@ Vehicle state -> causes of distrust (`PositionCause`) -> `PositionQuality`, with
 single glitch must not land a drone, and a bad position must not be flown. No clock is used.
 
 Errors that one receiver cannot notice, such as a drifting bias, are part of the margins: see
-docs/safety.md.
+docs/faults.md.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Margins from errors: between robots, to the ground, inside and around the fence.
 
 Each margin is a sum of errors that a vehicle may have at once, each at its worst and in the worst
-direction, so that it holds in truth whatever the estimates are. docs/safety.md shows the sums.
+direction, so that it holds in truth whatever the estimates are. docs/faults.md shows the sums.
 """
 
 import functools

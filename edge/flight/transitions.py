@@ -1,7 +1,7 @@
 """The flight state machine as a table: transitions, their conditions and effects.
 
 `TRANSITIONS` is sorted by severity: in each tick the first row that applies is taken. A row has all
-of its effects, so no other code depends on which row it was. docs/safety.md shows the same table.
+of its effects, so no other code depends on which row it was. docs/faults.md shows the same table.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Faults of the drill, each with the promise of docs/safety.md and the bounds that follow from it.
+"""Faults of the drill, each with the promise of docs/faults.md and the bounds that follow from it.
 
 Bounds are stated before anything is flown. `bounds.always` holds in every flight besides; a fault
 that by its nature may carry robots out of the fence says how far (`beyond_fence_m`).

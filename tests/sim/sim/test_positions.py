@@ -1,4 +1,4 @@
-"""What goes wrong with a simulated vehicle's position is judged as docs/safety.md has it.
+"""What goes wrong with a simulated vehicle's position is judged as docs/faults.md has it.
 
 By what the vehicle tells over its link, and what a robot concludes from it; nothing runs in real
 time.

@@ -212,12 +212,12 @@ def test_a_pause_of_the_receiver_stops_a_robot_and_does_not_land_it() -> None:
     )
 
 
-# Each row of docs/safety.md's table of wrong positions that the judgement has times for: the cause,
+# Each row of docs/faults.md's table of wrong positions that the judgement has times for: the cause,
 # after how long, and what happens as they stand there; what is told; and when, in s after it is
 # told (or after the last that was), the position is doubtful and lost.
-_LANDS = "stop; LAND 2 s after it was told"
+_LANDS = "stop; LAND 2 s after it was reported"
 WRONG: list[tuple[str, str, str, list[dict[str, Any]], float, float]] = [
-    ("no fix", "told within 0.3 s, and 0.4 s", "stop; LAND 2 s after it was told",
+    ("no fix", "reported within 0.3 s, and 0.4 s", "stop; LAND 2 s after it was reported",
      [NO_FIX], 0.4, 2.0),
     ("a fix that comes and goes, never there for 0.5 s", "as no fix",
      "stop; LAND after 60 s", FLICKERS, 0.4, 60.4),
@@ -234,19 +234,19 @@ WRONG: list[tuple[str, str, str, list[dict[str, Any]], float, float]] = [
     ("accuracy between 1.5 m and 5 m", "", "heights keep robots apart; before takeoff more room is "
      "asked for", [{"gps": dataclasses.replace(GPS, accuracy_m=5.0)}], math.inf, math.inf),
     ("the position jumps by 1 m or more", "0.4 s",
-     "stop, and on when nothing speaks against it for 3 s", [{"jumped_at_s": 0.0}], 0.4, math.inf),
+     "stop, and on once nothing spoke against it for 3 s", [{"jumped_at_s": 0.0}], 0.4, math.inf),
     ("fix and estimate are more than 5 m or 2 m/s apart", "0.2 s and 0.4 s", _LANDS,
      [{"gps": dataclasses.replace(GPS, offset_m=5.1)}], 0.4, 2.0),
     ("fix and estimate are more than 5 m or 2 m/s apart", "0.2 s and 0.4 s", _LANDS,
      [{"gps": dataclasses.replace(GPS, velocity_offset_m_s=2.1)}], 0.4, 2.0),
-    ("the fix moves otherwise than its own velocity says, by more than 5 m in 10 s",
+    ("the fix departs from its own velocity by more than 5 m in 10 s",
      "as long as that takes, and 0.4 s",
      "PX4 goes without it, at once; stop; LAND 2 s after it was noticed",
      [{"gps": dataclasses.replace(GPS, slip_m=5.1)}], 0.4, 2.0),
     ("the receiver repeats the same fix", "three repeats, 0.3 s to 0.8 s, and 0.4 s",
      "PX4 goes without it, at once; stop; LAND 2 s after it was noticed", [{"gps_repeats": 3}],
      0.4, 2.0),
-    ("the receiver jumps by less than 5 m", "never", "nothing: PX4 takes it for true and follows "
+    ("the receiver jumps by less than 5 m", "never", "nothing: PX4 believes it and follows "
      "smoothly", [{"gps": dataclasses.replace(GPS, offset_m=4.9)}], math.inf, math.inf),
     ("frozen values", "1 s and 0.4 s", "stop; LAND 2 s after the freeze was noticed",
      [{"position_changed_at_s": 0.0}], 1.4, 3.0),
@@ -262,7 +262,7 @@ def test_wrong_positions_are_noticed_when_the_table_says(
     doubted_s: float,
     lost_s: float,
 ) -> None:
-    page = (ROOT / "docs" / "safety.md").read_text()
+    page = (ROOT / "docs" / "faults.md").read_text()
     (row,) = (line for line in page.splitlines() if line.startswith(f"| {cause} | "))
     assert [cell.strip() for cell in row.split("|")[3:5]] == [after, happens]
     watch = Watch()

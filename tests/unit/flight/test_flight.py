@@ -95,6 +95,7 @@ AIRBORNE = (
     FlightState.LAND,
 )
 SAFETY_PAGE = ROOT / "docs" / "safety.md"
+FAULTS_PAGE = ROOT / "docs" / "faults.md"
 
 FENCE = Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 1.0, 30.0)
 ROBOT = Robot(
@@ -1382,9 +1383,9 @@ def test_a_lost_position_stops_and_then_lands(world: World) -> None:
 
 @pytest.mark.parametrize("beat_s_ago", [0.2, 0.9])
 def test_an_autopilot_that_falls_silent_is_stopped_landed_and_given_up(beat_s_ago: float) -> None:
-    """When docs/safety.md says, from its last word."""
-    after = "0.7 s and 2 s after its last position; FAULT 2.5 s after its last word of any kind"
-    assert f"| {after}, or 10 s after its last heartbeat" in SAFETY_PAGE.read_text()
+    """When docs/faults.md says, from its last message."""
+    after = "0.7 s and 2 s after its last position; FAULT 2.5 s after its last message of any kind"
+    assert f"| {after}, or 10 s after its last heartbeat" in FAULTS_PAGE.read_text()
     world = World()
     world.fly()
     while not beat_s_ago <= world.now_s - world.heard.heartbeat_at_s < beat_s_ago + TICK_S:
@@ -2199,13 +2200,13 @@ def test_late_telemetry_changes_no_outcome() -> None:
 
 
 def test_the_page_for_people_has_the_same_table() -> None:
-    page = SAFETY_PAGE.read_text().splitlines()
+    page = FAULTS_PAGE.read_text().splitlines()
     start = page.index("| From | To | When | The operator reads, for example |") + 2
     rows = page[start : page.index("", start)]
     expected = table()
     for row, wanted in zip(rows, expected, strict=False):
-        assert row == wanted, f"docs/safety.md: {MEND}"
-    assert len(rows) == len(expected), f"docs/safety.md: {MEND}"
+        assert row == wanted, f"docs/faults.md: {MEND}"
+    assert len(rows) == len(expected), f"docs/faults.md: {MEND}"
 
 
 def test_the_page_for_people_says_where_each_order_is_taken() -> None:

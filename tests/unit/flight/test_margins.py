@@ -177,7 +177,7 @@ def test_heights_of_simulated_vehicles_stay_apart_in_truth() -> None:
     assert min(nearest_m) >= least_m
     # Where control and pads are wrong too, clearly less is too little.
     assert min(nearest_m) < least_m + (1.0 - LESS) * DEFAULT.slot_spacing.least_m
-    # 2 m, as flown before, are so without that: docs/safety.md tells how often.
+    # 2 m, as flown before, are so without that: docs/faults.md tells how often.
     assert sum(nearest_in_truth_m(fleet, 2.0) < DEFAULT.drone_m for fleet in fleets) == 13
 
 

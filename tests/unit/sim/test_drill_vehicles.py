@@ -21,7 +21,7 @@ from tests.conftest import ROOT
 def test_the_table_tells_who_flies_what() -> None:
     rows = re.findall(
         r"^\| ([a-z0-9-]+) \| .* \| (yes|) \| (yes|) \|$",
-        (ROOT / "docs" / "drill.md").read_text(),
+        (ROOT / "docs" / "faults.md").read_text(),
         re.MULTILINE,
     )
     assert rows == [
