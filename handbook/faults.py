@@ -76,10 +76,9 @@ def _group(robots: RobotGroup) -> str:
 def _bound(bound: Bound) -> str:
     sign = "≥" if type(bound).worst is min else "≤"
     limit = f"{bound.told_as} {sign} {bound.limit:.3g} {bound.unit}".rstrip()
-    begin_s, end_s = max(bound.from_s, 0.0), bound.until_s
-    when = f"{begin_s:g}–{end_s:g} s" if end_s < math.inf else f"from {begin_s:g} s"
-    if begin_s == 0.0 and end_s == math.inf:
-        when = ""
+    begin = f"{bound.from_s:g} " if 0.0 < bound.from_s < math.inf else ""
+    end = f"to {bound.until_s:g} " if bound.until_s < math.inf else ""
+    when = f"{begin}{end}s" if end else f"from {begin}s" if begin else ""
     if bound.after:
         when = f'{when} after "{bound.after}"'.lstrip()
     return f"{limit} ({when})" if when else limit
