@@ -94,9 +94,9 @@ class Identity:
 
 def _followed(now: GroupKeys, given: tuple[bytes, ...], *, in_flight: bool) -> GroupKeys:
     if not in_flight:
-        return now if now.heard == given else GroupKeys(given, given[0])
-    older = tuple(key for key in now.heard if key not in given)
-    return now if now.heard == given + older else GroupKeys(given + older, now.spoken)
+        return now if now.receiving == given else GroupKeys(given, given[0])
+    older = tuple(key for key in now.receiving if key not in given)
+    return now if now.receiving == given + older else GroupKeys(given + older, now.sending)
 
 
 def load_identity(

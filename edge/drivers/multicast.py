@@ -100,12 +100,12 @@ class MulticastLink:
         head = read_head(data)
         if head is not None:
             self._own_start = head.number.start
-        spoken = GroupKey.of(self._group.keys().spoken)
+        sending = GroupKey.of(self._group.keys().sending)
         try:
             self._sender.setsockopt(
                 socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._group.interface)
             )
-            for datagram in datagrams(data, sender=self._robot_id, key=spoken):
+            for datagram in datagrams(data, sender=self._robot_id, key=sending):
                 self._sender.sendto(datagram, (self._group.address, self._group.port))
         except (OSError, ValueError) as error:  # No network, a full queue, or too large a message.
             self._failed("publish", error)
@@ -173,7 +173,7 @@ class MulticastLink:
         """Hear by the keys as they are now; what was told of a sender's key is over with them."""
         keys = self._group.keys()
         if keys != self._known:
-            self._known, self._keys = keys, tuple(map(GroupKey.of, keys.heard))
+            self._known, self._keys = keys, tuple(map(GroupKey.of, keys.receiving))
             self._assembly = Assembly(math.inf if self._group.is_secret else _FORGETS_AFTER_S)
 
     def _take(self, fragment: Fragment, now_s: float) -> None:

@@ -20,7 +20,7 @@ from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
 from edge.flight.safety import SeparationLimits
 from edge.flight.silence import highest_still_m, nearest_on_way_m, strays_m
-from edge.messages.beacon import Beacon, HeardBeacon, Neighbour, tag
+from edge.messages.beacon import Beacon, Neighbour, ReceivedBeacon, tag
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 
@@ -80,7 +80,7 @@ class PreflightInputs:
     landing_point_m: Sequence[float]
     min_separation_m: float
     errors: ErrorBudget
-    neighbours: Sequence[HeardBeacon]
+    neighbours: Sequence[ReceivedBeacon]
     strangers: Sequence[str]
     ground_release: str
     unheard: Sequence[int]

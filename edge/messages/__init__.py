@@ -1,1 +1,1 @@
-"""Messages between robots and ground."""
+"""Messages between robots and the ground."""

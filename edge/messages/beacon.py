@@ -1,8 +1,8 @@
-"""Beacon: header of everything that a robot says to robots, the same in every release.
+"""Beacon: header of each message from robot to robots, the same in every release.
 
-Behind it is what the robot's policy says (`edge.core.wire`); while the policy is silent, nothing.
-Who says it, which start of its program, and the message's number are in the envelope. So neighbours
-keep apart, and compare themselves before a flight, without hearing each other's statuses.
+The policy's message follows it (`edge.core.wire`), if there is one. The sender, its program's start
+and the message's number are in the envelope. With beacons, neighbours keep apart in flight and
+compare their settings before it, without each other's statuses.
 
 Little-endian:
 
@@ -13,18 +13,18 @@ Little-endian:
 | 18 | uint8 | flight state, by its place in `FlightState` | |
 | 19 | uint8 | bits: 1 armed, 2 disarmed, 4 position and velocity known | |
 | 20 | uint8 | system id of its vehicle, 0 if not known | |
-| 21 | uint16 | accuracy that its receiver reports, rounded up; 65535 if none | cm |
-| 23 | uint16 | since it was armed; 65535 if not known | s |
+| 21 | uint16 | accuracy that its GPS reports, rounded up; 65535 if none | cm |
+| 23 | uint16 | time since it was armed; 65535 if not known | s |
 | 25 | int32 | slot height | mm |
 | 29 | 2 x int32 | landing point x, y | mm |
 | 37 | uint32 | the mission frame's `frame_id`, 0 if none is set | |
 | 41 | uint32 | `tag` of the bundle's id | |
 | 45 | uint32 | `tag` of the world's id | |
-| 49 | uint32 | which ground's clock, 0 if none is known | |
+| 49 | uint32 | ground whose clock `sent` is by, 0 if none is known | |
 | 53 | float64 | send time by that clock | s |
-| 61 | float32 | how wrong the send time may be | s |
+| 61 | float32 | uncertainty of the send time | s |
 
-What is out of a field's bounds is said as the field's greatest or least, and refused if heard.
+Encoding clips a value to its field's bounds; decoding refuses one outside them.
 """
 
 import functools
@@ -47,7 +47,7 @@ _UNKNOWN = 65_535
 
 
 class _Number(NamedTuple):
-    """A field: its type, how many of its steps are one of its unit, and its bounds."""
+    """A field: struct code, steps per unit, and bounds."""
 
     code: str
     steps: int
@@ -89,9 +89,9 @@ _NO_TIME = 0, 0.0, 0.0
 class Beacon:
     """A robot's own state; positions as in `RobotStatus`, to 1 mm.
 
-    `sent` is when, None as long as the sender does not know the time. `bundle_tag` and `world_tag`
-    are the `tag`s of what it flies by; `frame_id` is 0 as long as it has no mission origin.
-    `other_release` is its release, by the envelope, "" if it is the own one.
+    `sent` is the send time, None until the sender knows the time. `bundle_tag` and `world_tag` are
+    the `tag`s of its bundle and world; `frame_id` is 0 without a mission origin. `other_release` is
+    the sender's release from the envelope, "" if it is the receiver's own.
     """
 
     robot_id: int
@@ -111,19 +111,18 @@ class Beacon:
     other_release: str = ""
 
 
-class HeardBeacon(Struct, frozen=True):
-    """Another robot's; when it came, and since when it may be on its way: monotonic clock, s."""
+class ReceivedBeacon(Struct, frozen=True):
+    """Another robot's beacon, its arrival and its earliest send time: monotonic clock, s."""
 
     beacon: Beacon
-    heard_at_s: float
+    received_at_s: float
     sent_at_s: float
 
 
 class Neighbour(Struct, frozen=True, array_like=True):
-    """Another robot: its position and velocity in the mission frame, as they were `age_s` ago.
+    """Another robot: its position and velocity in the mission frame, as of `age_s` ago.
 
-    `is_piloted`: somebody else than its program flies it, or it does not hold its height, so that
-    nobody knows where it flies next.
+    `is_piloted`: its program does not fly it, or it is off its height, so its path is unknown.
     """
 
     robot_id: int
@@ -134,12 +133,12 @@ class Neighbour(Struct, frozen=True, array_like=True):
 
 
 def tag(name: str) -> int:
-    """32 bits of a bundle's or a world's id, to tell whether two robots have the same."""
+    """32-bit hash of a bundle's or a world's id, for robots to compare."""
     return zlib.crc32(name.encode())
 
 
 def encode_beacon(beacon: Beacon) -> bytes:
-    """The bytes; who it is of is for the envelope to say."""
+    """The beacon's bytes, without the sender, which the envelope has."""
     position_m, velocity_m_s = beacon.position_m, beacon.velocity_m_s
     numbers = (*(position_m or ()), *(velocity_m_s or ()))
     placed = len(numbers) == 6 and all(map(math.isfinite, numbers))
@@ -165,13 +164,13 @@ def encode_beacon(beacon: Beacon) -> bytes:
 
 
 def decode_beacon(data: bytes | memoryview, robot_id: int, other_release: str = "") -> Beacon:
-    """The robot's beacon at the start of `data`. Raises MessageError."""
+    """The beacon at the start of `data`. Raises MessageError."""
     if len(data) < BEACON_BYTES:
         raise MessageError(f"Beacon: {len(data)} bytes: must be {BEACON_BYTES}")
     return _decoded(bytes(data[:BEACON_BYTES]), robot_id, other_release)
 
 
-# The robots of one process, as in a simulator, hear the same bytes within a moment.
+# In a simulator, the robots of one process decode the same bytes in turn.
 @functools.lru_cache(maxsize=8)
 def _decoded(body: bytes, robot_id: int, other_release: str) -> Beacon:
     values = []
@@ -208,11 +207,11 @@ def _decoded(body: bytes, robot_id: int, other_release: str) -> Beacon:
 
 
 def _ceil_cm(value_m: float) -> int:
-    # 2.0 cm are not 3, whatever the last bit says.
+    # A rounding error must not make 2.0 cm 3.
     return math.ceil(min(value_m * 1e2, _UNKNOWN - 1.0) - 1e-6)
 
 
 def _packed(number: _Number, value: float) -> float:
-    # Bounded first: not every float has an integer.
+    # Bounded first: round() raises for infinity and NaN.
     bounded = min(max(value, number.least), number.greatest)
     return bounded if number.code in "fd" else round(bounded * number.steps)

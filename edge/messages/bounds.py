@@ -1,6 +1,6 @@
 """Bounds of numbers, texts and lists in messages: decoding refuses everything else.
 
-The bounds are far outside of what a fleet needs, and inside of what costs or breaks anything.
+They are far beyond what a fleet needs, and below what costs or breaks anything.
 """
 
 from typing import Annotated
@@ -15,9 +15,9 @@ MOST_LETTERS = 1000
 
 
 RobotId = Annotated[int, Meta(ge=0, le=MAX_ROBOT_ID)]
-# JSON's keys are texts.
+# Keys of JSON objects are strings.
 RobotKey = Annotated[str, Meta(pattern=r"^[0-9]{1,5}$")]
-# Of 32 bits; 0 is none.
+# 32 bits; 0 is none.
 TimeBase = Annotated[int, Meta(ge=0, lt=2**32)]
 Nonce = Annotated[int, Meta(ge=0, lt=2**48)]
 Sequence = Annotated[int, Meta(ge=-1, le=2**48)]

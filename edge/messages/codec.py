@@ -1,7 +1,7 @@
-"""Messages <-> JSON. What is out of its bounds, or cannot be understood, is refused whole.
+"""Messages <-> JSON. A message with a malformed or out-of-bounds value is refused whole.
 
-Of another release's messages, what is not known here is ignored. A missing key has its default, but
-in a ground's state each must be there.
+Unknown keys, from another release, are ignored. A missing key has its default; a `GroundState` must
+have all keys.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from edge.messages.mission import GroundState
 
 T = TypeVar("T")
 
-# A state that lacks something says nothing that can be relied on.
+# A default in place of the ground's request could be unsafe.
 _KEYS_OF_STATE = frozenset(field.name for field in dataclasses.fields(GroundState))
 
 _encoder = msgspec.json.Encoder()
@@ -24,7 +24,7 @@ _decoders: dict[type, "msgspec.json.Decoder[Any]"] = {}
 
 
 class MessageError(ValueError):
-    """A message that is not understood; one line says why."""
+    """A message that cannot be decoded; one line says why."""
 
 
 def encode(message: object) -> bytes:
@@ -33,7 +33,7 @@ def encode(message: object) -> bytes:
 
 
 def decode(kind: type[T], data: bytes | msgspec.Raw) -> T:
-    """The message of that kind in `data`. Raises MessageError."""
+    """The message of type `kind` in `data`. Raises MessageError."""
     try:
         if kind is GroundState and (missing := _KEYS_OF_STATE - _keys.decode(data).keys()):
             raise MessageError(f"{kind.__name__}: {', '.join(sorted(missing))} is missing")
@@ -49,7 +49,7 @@ def _decoder(kind: type[T]) -> "msgspec.json.Decoder[T]":
 
 
 def _why(error: Exception, kind: type[Any], data: bytes | msgspec.Raw) -> str:
-    """Why something is no message of that kind: where it can be told, key, value and bounds."""
+    """Why `data` is no message of that kind: key, value and bounds, where known."""
     if isinstance(error, msgspec.ValidationError):
         with suppress(msgspec.MsgspecError, RecursionError):
             return explain(error, kind, msgspec.json.decode(data), kind.__name__)

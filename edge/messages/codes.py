@@ -1,7 +1,6 @@
-"""Codes for machines, words for people: why a robot does not do something, and why it did.
+"""Codes for programs and texts for people: failed checks, reasons and refusals.
 
-Whoever decides by one of these reads its `code`; its `text` is for people and may say the same in
-other words tomorrow.
+Programs decide by `code`. `text` is for people, and its wording may change in any release.
 """
 
 from collections.abc import Iterable
@@ -13,7 +12,7 @@ from edge.messages.bounds import MOST_LETTERS, Text
 
 
 class _Code(StrEnum):
-    """A newer program may say what this one has no name for: that is its member OTHER."""
+    """Codes of which unknown ones, from a newer release, become OTHER."""
 
     @classmethod
     def _missing_(cls, value: object) -> Self | None:
@@ -58,7 +57,7 @@ class CheckCode(_Code):
     GPS_NO_FIX = "gps_no_fix"
     GPS_FEW_SATELLITES = "gps_few_satellites"
     GPS_IMPRECISE = "gps_imprecise"
-    # Where it stands, flies and lands.
+    # Standing, flying and landing places.
     ORIGIN_NOT_SET = "origin_not_set"
     PLACE_NOT_KNOWN = "place_not_known"
     STANDS_OUTSIDE = "stands_outside"
@@ -79,7 +78,7 @@ class CheckCode(_Code):
     LANDING_POINT_TAKEN = "landing_point_taken"
     SILENT_NEAR = "silent_near"
     TAKEOFFS_TOO_FAR_APART = "takeoffs_too_far_apart"
-    # What of the ground's state it does not take up: in flight, or because it cannot.
+    # Parts of the ground's state that it does not adopt: in flight, or because it cannot.
     KEEPS_ORIGIN = "keeps_origin"
     KEEPS_FENCE = "keeps_fence"
     KEEPS_PLACE = "keeps_place"
@@ -89,7 +88,7 @@ class CheckCode(_Code):
     WORLD_UNUSABLE = "world_unusable"
 
 
-# What a robot says of the ground's fence, world or origin that it does not take up.
+# Codes for the ground's fence, world or origin that a robot does not adopt.
 FENCE_NOT_TAKEN = (
     CheckCode.KEEPS_FENCE,
     CheckCode.FENCE_OR_PLACE_UNFIT,
@@ -105,9 +104,9 @@ ORIGIN_NOT_TAKEN = (CheckCode.KEEPS_ORIGIN, CheckCode.ORIGIN_OUT_OF_REACH)
 
 @dataclass(frozen=True, slots=True)
 class FailedCheck:
-    """One thing that keeps a robot on the ground, and what to do about it.
+    """A failed check, which keeps a robot on the ground; `text` says what to do.
 
-    `settles_by_itself`: under open sky and with time it mostly ends without anybody.
+    `settles_by_itself`: waiting under open sky usually clears it.
     """
 
     code: CheckCode
@@ -147,7 +146,7 @@ class ReasonCode(_Code):
     PX4 = "px4"
     LINK_LOSES = "link_loses"
     LINK_TWICE = "link_twice"
-    # What the robot notices.
+    # The robot itself.
     CONTROL_SILENT = "control_silent"
     POSITION_LOST = "position_lost"
     POSITION_DOUBTFUL = "position_doubtful"
@@ -178,7 +177,7 @@ class ReasonCode(_Code):
     GROUND_LANDS = "ground_lands"
     GROUND_ENDS_TAKEOFF = "ground_ends_takeoff"
     ARMING_CALLED_OFF = "arming_called_off"
-    # The program itself.
+    # The program.
     DUPLICATE_ID = "duplicate_id"
     SAID_TWICE = "said_twice"
     STRANGERS_FLOOD = "strangers_flood"
@@ -192,7 +191,7 @@ class ReasonCode(_Code):
     GROUND_NOT_UNDERSTOOD = "ground_not_understood"
 
 
-# Alarms that tell of the battery.
+# Alarms about the battery.
 BATTERY_REASONS = (
     ReasonCode.BATTERY_CRITICAL,
     ReasonCode.BATTERY_LOW,
@@ -202,7 +201,7 @@ BATTERY_REASONS = (
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a robot is in its state, or what its operator must see."""
+    """Reason for a robot's state, or an alarm."""
 
     code: ReasonCode
     text: Text
@@ -212,7 +211,7 @@ class Reason:
 
 
 class RefusalCode(_Code):
-    """Why an order is not obeyed."""
+    """Reasons to refuse an order."""
 
     OTHER = "other"
     NOT_UNDERSTOOD = "not_understood"
@@ -244,7 +243,7 @@ class RefusalCode(_Code):
     REMOTE_CONTROL_LOST = "remote_control_lost"
     OTHERS_TAKE_OFF = "others_take_off"
     TOO_CLOSE = "too_close"
-    # What the ground says of an order that no robot answered.
+    # Set by the ground for an order without an answer.
     STARTED_AGAIN = "started_again"
     NOT_ANSWERED = "not_answered"
     INTERRUPTED = "interrupted"
@@ -252,7 +251,7 @@ class RefusalCode(_Code):
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why an order is not obeyed."""
+    """A robot's reason to refuse an order."""
 
     code: RefusalCode
     text: Text
@@ -261,12 +260,12 @@ class Refusal:
         _shorten(self)
 
 
-def texts(said: Iterable[FailedCheck | Reason]) -> str:
-    """All of their words, on one line."""
-    return "; ".join(each.text for each in said)
+def texts(items: Iterable[FailedCheck | Reason]) -> str:
+    """Their texts, on one line."""
+    return "; ".join(each.text for each in items)
 
 
-def _shorten(said: FailedCheck | Reason | Refusal) -> None:
-    """Longer texts are not taken by whoever hears them."""
-    if len(said.text) > MOST_LETTERS:
-        object.__setattr__(said, "text", f"{said.text[: MOST_LETTERS - 4]} ...")
+def _shorten(item: FailedCheck | Reason | Refusal) -> None:
+    # Receivers refuse a longer text, and its whole message.
+    if len(item.text) > MOST_LETTERS:
+        object.__setattr__(item, "text", f"{item.text[: MOST_LETTERS - 4]} ...")

@@ -1,10 +1,10 @@
 """Messages between the ground and the robots.
 
-Two kinds of message go to the robots. `GroundState` is published again and again, so that nothing
-depends on one packet; what it says can only hold, return or land a robot. An `Order` happens once:
-it names the robot and its boot nonce, and expires. Nothing that repeats can arm a vehicle.
+The ground repeats a `GroundState`, so that nothing depends on one packet: it can only hold, return
+or land a robot. An `Order` takes effect once: it names the robot and its boot nonce, and expires.
+No repeated message can arm a vehicle.
 
-`edge.messages.topics` lists what travels under which key, `edge.messages.codec` makes bytes of it.
+`edge.messages.topics` has their topics, `edge.messages.codec` encodes them.
 """
 
 import hashlib
@@ -106,13 +106,13 @@ class Origin(Bounded):
     heading_deg: Heading
 
     def frame(self) -> MissionFrame:
-        """The mission frame itself."""
+        """The mission frame at this origin."""
         return MissionFrame(self.latitude_deg, self.longitude_deg, math.radians(self.heading_deg))
 
 
 @dataclass(frozen=True, slots=True)
 class Place(Bounded):
-    """A robot's place in the flight: its height's `slot`, and where it lands, (x, y), m."""
+    """A robot's place in the flight: the `slot` of its height, and its landing point (x, y), m."""
 
     slot: SlotNumber
     landing_point_m: _Point
@@ -120,7 +120,7 @@ class Place(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class Echo:
-    """A robot's newest status, as its ground heard it `held_s` before it says so."""
+    """Echo of a robot's newest status, which the ground received `held_s` before it sends this."""
 
     boot_nonce: Nonce
     uptime_s: Seconds
@@ -129,9 +129,9 @@ class Echo:
 
 @dataclass(frozen=True, slots=True)
 class SafetyRequest:
-    """The part of a `GroundState` by which robots hold and land, even if they refuse the rest.
+    """The part of a `GroundState` that robots obey even if they refuse the rest.
 
-    An action that this release does not know asks for nothing.
+    An action unknown in this release counts as "none".
     """
 
     sequence: Sequence
@@ -142,26 +142,26 @@ class SafetyRequest:
     )
 
     def safety_action_for(self, robot_id: int) -> SafetyAction:
-        """Safety action that is asked of one robot."""
+        """Safety action for one robot."""
         asked = self.robot_safety_actions.get(str(robot_id), self.safety_action)
         return _SAFETY_ACTIONS.get(asked, "none")
 
 
 @dataclass(frozen=True, slots=True)
 class GroundState(SafetyRequest):
-    """The ground's wishes for as long as it repeats them; `sequence` grows with every change.
+    """The ground's requests, valid while it repeats them; `sequence` grows with every change.
 
-    `operator` is who commands; of two states with one sequence the greater operator's counts.
+    `operator` is the commander's; of two states with one sequence the greater operator's counts.
     `enabled` lets robots run their preflight checks. `safety_action` asks the fleet to hold, to
-    return to the landing points, or to land; `safety_action_by` is who asked, if it was not
-    `operator`. `robot_enabled` and `robot_safety_actions` (robot id as text) override them for one
-    robot. Withdrawing it sets nothing in motion. `origin`, `fence` (None: the robot's
-    configured one), `places` (by robot id; who is not in it keeps its configured one) and
-    `world_id` (None: whatever the robot has) are taken up on the ground only. `trial` is the
-    mission's name. `unix_time_s` is the ground's wall clock when it said so, `time_s` the fleet's
-    time, which is the clock of the ground `time_base`; `echoes` are for robots (by id) to find out
-    how long messages travel. `waiting` are those that hold in a return only until their way down is
-    free: nobody asked them to.
+    return to the landing points, or to land; `safety_action_by` is the operator who asked, if not
+    `operator`. `robot_enabled` and `robot_safety_actions` override these for one robot, by its id.
+    Withdrawing a safety action sets nothing in motion.
+
+    Robots adopt `origin`, `fence`, `places` and `world_id` on the ground only. Without a `fence` or
+    a place a robot uses its configured one, without a `world_id` the one that it has. `trial` is
+    the mission's name. `unix_time_s` is the ground's wall clock at the send time. `time_s` is the
+    fleet's time, by the clock of the ground `time_base`; robots find messages' ages from `echoes`,
+    by robot id. `waiting` are robots that hold during a return only until their way down is free.
     """
 
     safety_action: SafetyAction = field(default="none", kw_only=True)
@@ -189,17 +189,17 @@ class GroundState(SafetyRequest):
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Something to do once. The ground may repeat the same order until it is answered.
+    """A request to do something once. The ground may repeat it until the robot answers.
 
-    It is for the start of the program whose `boot_nonce` it names, and expires at
-    `expires_at_uptime_s` of the robot's own uptime, `ORDER_LIFETIME_S` after the status that the
-    ground saw: clocks need not agree. `trial` names the mission of a start: another one than the
-    last has the explored map and the neighbours' messages forgotten. A reset does, too; the robot's
-    own trial is then "" until it starts again.
+    It is for the start of the program with this `boot_nonce`. It expires when the robot's own
+    uptime reaches `expires_at_uptime_s`, `ORDER_LIFETIME_S` after the status that the ground had:
+    clocks need not agree. `trial` names the mission of a start. With a new trial, robots clear the
+    explored map and the neighbours' messages. A reset clears them too; the trial is then "" until
+    the next start.
 
-    `pilot` gives the vehicle, which holds, to a human; `rejoin` takes it back. `disarm` stops the
-    motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone. `kind` is
-    an `OrderKind`; a robot refuses any other.
+    `pilot` gives the holding vehicle to a human; `rejoin` takes it back. `disarm` stops the motors
+    on the ground only, `kill` anywhere. All but `kill` are the commander's alone. `kind` is an
+    `OrderKind`; a robot refuses any other.
     """
 
     order_id: Name
@@ -213,35 +213,35 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """A hold that a station asks for while another one commands, for as long as it is repeated.
+    """A hold request from a station that does not command, valid while it repeats it.
 
-    `robots` that are not to fly on, by id; without any, all. It lasts `HOLD_LASTS_S` after it came.
+    It applies to `robots`, by id, or to all if empty, and expires `HOLD_LASTS_S` after arrival.
     """
 
     by: Name
     robots: Annotated[tuple[RobotId, ...], _OfRobots] = ()
 
     def is_of(self, robot_id: int) -> bool:
-        """Whether that robot is to hold."""
+        """Whether that robot must hold."""
         return not self.robots or robot_id in self.robots
 
 
 @dataclass(frozen=True, slots=True)
 class OrderResult:
-    """A robot's answer to an order: obeyed, unless there is a `refusal`."""
+    """A robot's answer to an order, which it obeyed unless there is a `refusal`."""
 
     order_id: Name
     refusal: Refusal | None = None
 
     @property
     def accepted(self) -> bool:
-        """Whether it was obeyed."""
+        """Whether the robot obeyed."""
         return self.refusal is None
 
 
 @dataclass(frozen=True, slots=True)
 class LoopStatus:
-    """One loop's counts since the start, and its lateness, ms, over the last minute."""
+    """One loop's counts since the start, and its lateness over the last minute, ms."""
 
     ticks: Count
     overruns: Count
@@ -253,10 +253,10 @@ class LoopStatus:
 
 @dataclass(frozen=True, slots=True)
 class RadioCounts:
-    """Counts of messages between a robot and its neighbours since the start of its program.
+    """Counts of messages between a robot and its neighbours since its program's start.
 
-    `sent` is how many messages it had for them, `sent_bytes` what these had together, without
-    envelopes. `arrivals` is what came of each, also too late: `Arrivals.counts`, by robot.
+    It sent them `sent` messages of `sent_bytes` in all, without envelopes. `arrivals` has each
+    robot's `Arrivals.counts`, late messages included.
     """
 
     sent: Count
@@ -268,24 +268,26 @@ class RadioCounts:
 class RobotStatus:
     """A robot's report of itself, a few times a second.
 
-    `ready` means that a takeoff order would be taken; else `failed_checks` says why not. Positions
-    are in the mission frame, heights above the robot's own takeoff point, m. `obeyed_sequence` is
-    the last ground state's that it obeyed. `alarms` are for the operator, the gravest first;
-    `not_taken` says what of the ground's state the robot does not take up now, and why.
-    `global_deg` is its latitude and longitude. `policy_velocity_m_s` (2,) is what the policy asks
-    for now, also on the ground; `feature_age_s` is the age of the features that it asks from.
-    `message_counts` is what became of all messages since the start: "accepted", or why not.
-    `neighbour_messages` counts each neighbour's; `radio_counts` are in one status of some, and None
-    in the others. `ground_age_s` is how long ago the state that it obeys was heard, None if never.
-    `position_quality` is what its position is worth, `position_cause` what speaks against it;
-    `gps_accuracy_m` is the receiver's own figure. `remote_control` tells whether its pilot's is
-    heard, None where there is none. `battery_lasts_s` is how long it flies until its battery is
-    critical, `home_s` what it needs to be landed with the reserve left, and `endurance_s` what a
-    full battery would last. `flown_s` is how long ago it was armed, None if it is not, or was so
-    before its program started.
+    `ready` means that it would accept a takeoff order; else `failed_checks` says why not. Positions
+    are in the mission frame, heights above its own takeoff point, m. `obeyed_sequence` is the last
+    ground state's that it obeyed. `alarms` are for the operator, the gravest first. `not_taken`
+    lists parts of the ground's state that it does not adopt now, and why. `global_deg` is latitude
+    and longitude.
 
-    What is not finite, of what may be None, is None: whatever a sensor says, nobody else has to
-    look. Raises ValueError for what must be there and is not finite.
+    `policy_velocity_m_s` (2,) is the policy's present request, also on the ground; `feature_age_s`
+    is the age of its features. `message_counts` counts all messages since the start: "accepted", or
+    by the reason to refuse them. `neighbour_messages` counts the accepted ones of each neighbour.
+    `radio_counts` are None in most statuses. `ground_age_s` is the age of the ground state that it
+    obeys, None before the first.
+
+    `position_quality` rates its position, and `position_cause` says what lowers it;
+    `gps_accuracy_m` is the GPS's own figure. `remote_control` is whether the pilot's is received,
+    None without one. `battery_lasts_s` is the flight time until the battery is critical, `home_s`
+    the time to land with the reserve left, `endurance_s` a full battery's flight time. `flown_s` is
+    the time since arming, None if disarmed, or armed before the program's start.
+
+    Optional values that are not finite become None, whatever a sensor reports. Raises ValueError
+    for a required one.
     """
 
     robot_id: RobotId
@@ -346,8 +348,8 @@ class RobotStatus:
             raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be 2 numbers")
         ages_s = self.neighbour_ages_s
         if not all(map(math.isfinite, ages_s.values())):
-            heard = {robot: age_s for robot, age_s in ages_s.items() if math.isfinite(age_s)}
-            object.__setattr__(self, "neighbour_ages_s", heard)
+            finite = {robot: age_s for robot, age_s in ages_s.items() if math.isfinite(age_s)}
+            object.__setattr__(self, "neighbour_ages_s", finite)
 
 
 _NEVER_NONE = (
@@ -362,23 +364,23 @@ def _numbers_of_status() -> tuple[str, ...]:
 
 
 def is_over_landing_point(status: RobotStatus) -> bool:
-    """Whether the robot has come home, as far as it knows."""
+    """Whether the robot reports a position over its landing point."""
     if status.position_m is None:
         return False
     return math.dist(status.position_m[:2], status.landing_point_m) < _OVER_LANDING_POINT_M
 
 
 def is_too_low(status: RobotStatus) -> bool:
-    """Whether the robot is so far below its own height that it cannot start a mission there."""
+    """Whether the robot is too far below its own height to start a mission."""
     if status.position_m is None:
         return False
     return status.slot_height_m - status.position_m[2] > AT_SLOT_M
 
 
 def waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int]) -> set[int]:
-    """Ids of those that `arrived` over their landing points and must not land yet.
+    """Ids of robots in `arrived`, over their landing points, that must not land yet.
 
-    Landing leads through the heights of all lower robots: somebody still flies home there.
+    They would descend through the heights of lower robots that still fly home.
     """
     lowest_m = min(
         (s.slot_height_m for r, s in statuses.items() if s.state in STEERED and r not in arrived),
@@ -392,19 +394,19 @@ def waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int
 
 
 def world_id(text: str) -> str:
-    """Name of a world file: the first 12 hexadecimal digits of its sha256."""
+    """Id of a world file: the first 12 hexadecimal digits of its SHA-256."""
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def explored_to_bytes(explored: Bools) -> bytes:
-    """(64, 64) over the policy's world, indexed [x, y]: True where the robot has seen the cell."""
+    """Pack an explored map (64, 64) over the policy's world, [x, y]: True where it was seen."""
     if explored.shape != (EXPLORED_CELLS, EXPLORED_CELLS):
         raise ValueError(f"explored has shape {explored.shape}")
     return np.packbits(explored).tobytes()
 
 
 def explored_from_bytes(data: bytes) -> Bools:
-    """The inverse of `explored_to_bytes`. Raises ValueError if the size is wrong."""
+    """Unpack `explored_to_bytes`. Raises ValueError if the size is wrong."""
     if len(data) != EXPLORED_CELLS**2 // 8:
         raise ValueError(f"explored has {len(data)} bytes: must be {EXPLORED_CELLS**2 // 8}")
     bits = np.unpackbits(np.frombuffer(data, np.uint8)).astype(np.bool_)

@@ -1,7 +1,7 @@
-"""Radio traffic: the one table of topics.
+"""Topics of the radio, and the interface of links.
 
-A topic's key is `lpac/<fleet>/robot/<id>/<name>` or `lpac/<fleet>/ground/<name>`. The link takes
-who sends what, sizes and priorities from here, and drops what is larger.
+A topic's key is `lpac/<fleet>/robot/<id>/<name>` or `lpac/<fleet>/ground/<name>`. Links take each
+topic's sender, size limit and priority from here, and drop larger messages.
 """
 
 import re
@@ -20,12 +20,10 @@ Priority = Literal["now", "later"]
 class Topic(NamedTuple):
     """One kind of message.
 
-    `content` names what its bytes are, `rate_hz` is how often one sender says it, `most_hz` how
-    often a key is listened to at most, and
-    `most_of_one_hz` of that one connection, if several speak on the key; `limit_bytes` is the
-    largest that is listened to, `logged` the flight log's topic that holds what came or went.
-    Of what is sent at once, "later" goes when nothing else waits. A `deflated` payload travels as a
-    raw deflate stream, of at most `limit_bytes` when unpacked.
+    `content` names its type, `rate_hz` is one sender's rate. Receivers accept at most `most_hz` on
+    a key, `most_of_one_hz` of it from one connection, and `limit_bytes` a message. `logged` is the
+    flight log's topic for these messages. Messages with priority "later" wait until no others do. A
+    `deflated` payload travels as a raw deflate stream, of at most `limit_bytes` when inflated.
     """
 
     name: str
@@ -41,20 +39,20 @@ class Topic(NamedTuple):
 
     @property
     def pattern(self) -> str:
-        """The key of all its senders, below `lpac/<fleet>/`."""
+        """Key expression of all its senders, below `lpac/<fleet>/`."""
         return f"robot/*/{self.name}" if self.sender == "robot" else f"ground/{self.name}"
 
 
-# A policy may be run faster than the paper's, and a ground orders each robot of a fleet at once.
+# `most_hz` leaves room for a policy faster than the paper's, and for orders to all robots at once.
 MESSAGE = Topic(
     "message", "robot", "Beacon, AggregatedMessage", 2.5, 100, 2**20, "now", "received",
     deflated=False,  # `edge.core.wire` compresses what is worth it.
 )  # fmt: skip
 STATUS = Topic("status", "robot", "RobotStatus", 2.0, 20, 2**16, "now", "status")
 EXPLORED = Topic("explored", "robot", "bits", 1.0, 5, 2**10, "later", None)
-# Of ten grounds, so that one that floods, such as a revoked laptop, drowns no other's hold. What is
-# said within such a time of the last is not heard, which is why an order has none: those for all
-# robots of a fleet go at once.
+# Room for ten grounds: one that floods, such as a revoked laptop, must not drown another's hold.
+# `most_of_one_hz` drops a message that follows the last too closely, so orders have none: those for
+# all robots go at once.
 STATE = Topic("state", "ground", "GroundState", 2.5, 500, 2**16, "now", "ground", 50)
 HOLD = Topic("hold", "ground", "Hold", 2.5, 500, 2**14, "now", None, 50)
 ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")
@@ -64,40 +62,40 @@ TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, HOLD, ORDER, WORLD)
 
 
 def robot_id_in(key: str) -> int | None:
-    """Id of the robot whose key this is, below `lpac/<fleet>/`; None if it is no robot's."""
+    """Robot id in a key below `lpac/<fleet>/`; None if it is no robot's key."""
     found = _ROBOT_KEY.match(key)
     return int(found[1]) if found and int(found[1]) <= MAX_ROBOT_ID else None
 
 
 class Link(Protocol):
-    """The radio. Called from any thread; nothing waits, and nothing raises."""
+    """The radio. Methods may be called from any thread; they neither block nor raise."""
 
     def publish(self, topic: Topic, data: bytes) -> None:
-        """Send to whoever listens; it may be lost."""
+        """Send to all subscribers, without a guarantee of delivery."""
 
     def is_claimed(self, robot_id: int) -> bool:
-        """Whether another program than this one says that it is that robot."""
+        """Whether another program claims to be that robot."""
 
     def peers(self) -> int:
-        """How many others it reaches now."""
+        """Number of other programs that it reaches now."""
 
     def refused(self) -> int:
-        """How many messages it did not look at: too many at once, or too large."""
+        """Count of messages dropped before decoding: too many at once, or too large."""
 
 
-# Of the key below `lpac/<fleet>/` and the data; from any thread, and it only stores. False: it was
-# nobody's word.
+# Takes the key below `lpac/<fleet>/` and the data, on any thread; it must only store them. Returns
+# False if it refused the message.
 ReceiveCallback = Callable[[str, bytes], bool | None]
 
 
 class Knocking(Protocol):
-    """Maker of a member's knocks, and verifier of others'."""
+    """Maker and verifier of knocks: signed datagrams that open a member's port (port knocking)."""
 
     def knock(self, place: str) -> bytes:
-        """A new datagram, which says who this is, for the port at `place`: IPv4 address:port."""
+        """A new knock from this member for the port at `place`: IPv4 address:port."""
 
     def is_knock(self, data: bytes, place: str) -> bool:
-        """Whether a member sent it to that port, for the first time."""
+        """Whether it is a member's knock for that port, and no replay."""
 
 
 class TlsFiles(NamedTuple):
@@ -109,20 +107,17 @@ class TlsFiles(NamedTuple):
 
 
 class GroupKeys(NamedTuple):
-    """Keys of a multicast group, 32 bytes each: all that are heard, the newest first.
+    """Keys of a multicast group, 32 bytes each; `receiving` has all accepted ones, newest first."""
 
-    `spoken` is the one of them that is spoken with.
-    """
-
-    heard: tuple[bytes, ...]
-    spoken: bytes
+    receiving: tuple[bytes, ...]
+    sending: bytes
 
 
 class Group(NamedTuple):
-    """A multicast group in which robots tell each other what they say.
+    """A multicast group for the messages from robot to robots.
 
-    `interface` is the robot's own IPv4 address, by whose network it is reached. `keys` returns the
-    fleet's, as they are now. Without `is_secret` they are no secret.
+    `interface` is the robot's own IPv4 address in the group's network. `keys` returns the present
+    keys; they are secret only with `is_secret`.
     """
 
     address: str
@@ -135,12 +130,10 @@ class Group(NamedTuple):
 class LinkSetting(NamedTuple):
     """The radio's settings in robot.toml: see `edge.robot.config.LinkConfig`.
 
-    With `robot_id` None it only listens. `subscriptions` maps topics to callbacks, which are called
-    from any thread with the key below `lpac/<fleet>/`, such as robot/3/message, and the data; they
-    only store. What is larger or more often than its topic allows is for the link to drop
-    (`edge.messages.admission`). With `tls` only members of the fleet are let in; without, whoever
-    reaches it. With `group` robots tell each other there what they have to say. With `members`
-    it keeps strangers from its port, where it has one.
+    With `robot_id` None it only subscribes. `subscriptions` maps topics to callbacks. The link must
+    drop messages that exceed their topic's rate or size (`edge.messages.admission`). With `tls`
+    only members of the fleet can connect; without, everybody who reaches it. With `group`, messages
+    from robot to robots go by multicast. With `members`, a listening port admits members alone.
     """
 
     fleet: str
@@ -156,7 +149,7 @@ class LinkSetting(NamedTuple):
 
 
 class LinkDriver(Protocol):
-    """A type of radio. It is closed when the robot's program ends."""
+    """A type of radio: a factory of links, which are closed when the robot's program ends."""
 
     def __call__(self, setting: LinkSetting) -> AbstractContextManager[Link]:
-        """Raises ValueError or OSError, one line, for a setting that cannot be used."""
+        """Open a link. Raises ValueError or OSError, one line, for an unusable setting."""

@@ -28,7 +28,7 @@ from edge.flight.state import (
     height_m,
 )
 from edge.flight.step import step
-from edge.messages.beacon import Beacon, HeardBeacon, Neighbour
+from edge.messages.beacon import Beacon, Neighbour, ReceivedBeacon
 from edge.messages.codes import CheckCode, FailedCheck, Reason
 from edge.messages.mission import (
     AIRBORNE,
@@ -114,7 +114,7 @@ class FlightControl:
         # By robot id: the last that was heard of it in this frame, and when that was so.
         self._last_places: dict[int, tuple[Neighbour, float]] = {}
         # The last beacon of who flies that tells a place, in this frame.
-        self._last_words: dict[int, HeardBeacon] = {}
+        self._last_words: dict[int, ReceivedBeacon] = {}
         # The last beacon of each, in this frame: who stands somewhere may have been switched off.
         self._last_beacons: dict[int, Beacon] = {}
         self._lands_beside_m: Point | None = None
@@ -362,7 +362,7 @@ class FlightControl:
             world=world_id,
         )
 
-    def _neighbours(self, peers: tuple[HeardBeacon, ...], now_s: float) -> tuple[Neighbour, ...]:
+    def _neighbours(self, peers: tuple[ReceivedBeacon, ...], now_s: float) -> tuple[Neighbour, ...]:
         """Robots to keep away from: also those whose policies are silent."""
         return tuple(
             Neighbour(
@@ -373,7 +373,7 @@ class FlightControl:
                 beacon.state is FlightState.PILOT or _is_off_height(beacon),
             )
             for heard in peers
-            if now_s - heard.heard_at_s <= _KEEPS_AWAY_S
+            if now_s - heard.received_at_s <= _KEEPS_AWAY_S
             and (beacon := heard.beacon).frame_id == self._pac.frame_id
             and beacon.position_m is not None
             and beacon.velocity_m_s is not None
@@ -395,7 +395,7 @@ class FlightControl:
 
     def _silent(
         self,
-        peers: tuple[HeardBeacon, ...],
+        peers: tuple[ReceivedBeacon, ...],
         heard: tuple[Neighbour, ...],
         silence: SilenceLimits,
         now_s: float,
@@ -417,13 +417,13 @@ class FlightControl:
                 self._last_words[beacon.robot_id] = heard_beacon
         others = {self.assignment.robot.robot_id, *(n.robot_id for n in heard), *self.revoked}
         return tuple(
-            replace(told, age_s=now_s - self._last_words[robot_id].heard_at_s)
+            replace(told, age_s=now_s - self._last_words[robot_id].received_at_s)
             for robot_id in sorted(self._last_words.keys() - others)
             if (told := last_word(self._last_words[robot_id].beacon, silence)) is not None
         )
 
     def _look_where_to_land(
-        self, peers: tuple[HeardBeacon, ...], silent: tuple[Neighbour, ...]
+        self, peers: tuple[ReceivedBeacon, ...], silent: tuple[Neighbour, ...]
     ) -> Point | None:
         frame_id, robot = self._pac.frame_id, self.assignment.robot
         for peer in peers:

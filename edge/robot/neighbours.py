@@ -15,7 +15,7 @@ from edge.core.aggregation import AggregatedMessage
 from edge.core.arrivals import Arrivals
 from edge.core.schema import NonNegative, require
 from edge.core.wire import Rejection
-from edge.messages.beacon import Beacon, HeardBeacon
+from edge.messages.beacon import Beacon, ReceivedBeacon
 
 # After a cut, TCP delivers data that is up to 2 s old; nothing is in transit longer than this.
 _LONGEST_TRANSIT_S = 5.0
@@ -42,7 +42,7 @@ class _Robot:
     """One robot's newest beacon, and its policy's newest message."""
 
     number: Number
-    heard: HeardBeacon
+    heard: ReceivedBeacon
     message_number: Number = _NO_NUMBER
     # Taken by the swap, and not yet.
     handed_out: ReceivedMessage | None = None
@@ -121,12 +121,12 @@ class NeighbourTable:
             return Rejection.OWN
         # The position of an older message is taken as of its arrival, not extrapolated.
         known_s = age_s if age_s is not None and age_s < self._extrapolated_s else 0.0
-        heard = HeardBeacon(beacon, now_s, now_s - known_s)
+        heard = ReceivedBeacon(beacon, now_s, now_s - known_s)
         robot = self._robots.get(beacon.robot_id)
         if robot is None:
             robot = _Robot(number, heard)
             self._robots = dict(sorted([*self._robots.items(), (beacon.robot_id, robot)]))
-        silent = now_s - robot.heard.heard_at_s > self._restart_silence_s
+        silent = now_s - robot.heard.received_at_s > self._restart_silence_s
         if silent and number[0] != robot.message_number[0]:
             robot.message_number = _NO_NUMBER
         if number > robot.number or silent:
@@ -174,11 +174,11 @@ class NeighbourTable:
 
     # For everybody else
 
-    def heard(self, now_s: float, max_age_s: float) -> tuple[HeardBeacon, ...]:
+    def heard(self, now_s: float, max_age_s: float) -> tuple[ReceivedBeacon, ...]:
         """Beacons that came in the last `max_age_s`, of any mission frame, by robot id."""
         with self._lock:
             heard = [robot.heard for robot in self._robots.values()]
-        return tuple(each for each in heard if now_s - each.heard_at_s <= max_age_s)
+        return tuple(each for each in heard if now_s - each.received_at_s <= max_age_s)
 
     def is_own_id_heard(self, now_s: float) -> bool:
         """Whether another program sent a message with this robot's id in the last seconds."""
@@ -187,7 +187,7 @@ class NeighbourTable:
     def last_heard_s(self, robot_id: int) -> float:
         """When the robot was heard last; -inf if never."""
         robot = self._robots.get(robot_id)
-        return -math.inf if robot is None else robot.heard.heard_at_s
+        return -math.inf if robot is None else robot.heard.received_at_s
 
     def counts(self) -> dict[str, int]:
         """How many policies' messages were accepted, and rejected for each reason, so far."""

@@ -17,7 +17,7 @@ from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
 from edge.flight.preflight import PreflightInputs, failed_checks
 from edge.flight.state import Px4Change, Robot
-from edge.messages.beacon import HeardBeacon, Neighbour
+from edge.messages.beacon import Neighbour, ReceivedBeacon
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 from edge.robot.config import RobotConfig
@@ -137,7 +137,7 @@ class Readiness:
         assignment: Assignment,
         position: PositionJudgement,
         odometry: Odometry | None,
-        peers: Sequence[HeardBeacon],
+        peers: Sequence[ReceivedBeacon],
         strangers: Sequence[str],
         ground_release: str,
         unheard: Sequence[int],

@@ -164,8 +164,8 @@ def test_robots_share_a_key_of_the_group_that_changes_when_one_leaves(
         )
         give_list(authority, tmp_path / "r1")
         keys = load_identity(tmp_path / "r1", fleet="demo", unix_s=2e9).group_keys
-        assert keys is not None and keys.spoken == keys.heard[0]
-        return keys.heard
+        assert keys is not None and keys.sending == keys.receiving[0]
+        return keys.receiving
 
     for robot_id in (1, 2):
         new_member(authority, tmp_path / f"r{robot_id}", Role.ROBOT, f"r{robot_id}", robot_id)
@@ -198,17 +198,17 @@ def test_in_flight_the_groups_key_that_is_spoken_stays(
     identity = load_identity(folder, fleet="demo", unix_s=2e9)
     guard = identity.guard(lambda: 0.0)
     assert identity.group_keys is not None
-    first = identity.group_keys.spoken
+    first = identity.group_keys.sending
     for leaves in ("r2", "r3"):
         authority.revoke(leaves)
         write_file(folder / GROUP_KEYS, (authority.folder / GROUP_KEYS).read_bytes(), 0o600)
         give_list(authority, folder)
         identity.take_up(guard, in_flight=True)
-        assert identity.group_keys.spoken == first == identity.group_keys.heard[-1]
-    assert len(identity.group_keys.heard) == 3
+        assert identity.group_keys.sending == first == identity.group_keys.receiving[-1]
+    assert len(identity.group_keys.receiving) == 3
     identity.take_up(guard)
-    assert len(identity.group_keys.heard) == 2 and first not in identity.group_keys.heard
-    assert identity.group_keys.spoken == identity.group_keys.heard[0]
+    assert len(identity.group_keys.receiving) == 2 and first not in identity.group_keys.receiving
+    assert identity.group_keys.sending == identity.group_keys.receiving[0]
 
 
 def test_secrets_are_for_nobody_else(authority: Authority, tmp_path: Path) -> None:

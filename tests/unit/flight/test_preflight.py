@@ -21,7 +21,7 @@ from edge.flight.preflight import (
 from edge.flight.reach import Reach
 from edge.flight.safety import SeparationLimits
 from edge.flight.silence import SilenceLimits
-from edge.messages.beacon import Beacon, HeardBeacon, Neighbour, tag
+from edge.messages.beacon import Beacon, Neighbour, ReceivedBeacon, tag
 from edge.messages.codes import CheckCode
 from edge.messages.mission import FlightState, Origin
 
@@ -82,7 +82,7 @@ READY = PreflightInputs(
     landing_point_m=(8.0, 8.0),
     min_separation_m=2.0,
     errors=ErrorBudget(),
-    neighbours=(HeardBeacon(NEIGHBOUR, 99.8, 99.8),),
+    neighbours=(ReceivedBeacon(NEIGHBOUR, 99.8, 99.8),),
     strangers=(),
     ground_release="",
     unheard=(),
@@ -147,7 +147,9 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
     (
         {
             "neighbours": (
-                HeardBeacon(dataclasses.replace(NEIGHBOUR, other_release="01020304"), 99.8, 99.8),
+                ReceivedBeacon(
+                    dataclasses.replace(NEIGHBOUR, other_release="01020304"), 99.8, 99.8
+                ),
             )
         },
         _C.OTHER_RELEASE,
@@ -233,7 +235,7 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
     (
         {
             "neighbours": (
-                HeardBeacon(
+                ReceivedBeacon(
                     dataclasses.replace(
                         NEIGHBOUR, frame_id=7, armed=False, position_m=(8.0, 8.0, 0.0)
                     ),
@@ -377,15 +379,15 @@ def test_what_a_lost_autopilot_said_before_counts_for_nothing() -> None:
 
 
 def test_a_neighbour_without_an_origin_has_not_ours() -> None:
-    neighbour = HeardBeacon(dataclasses.replace(NEIGHBOUR, frame_id=0), 99.8, 99.8)
+    neighbour = ReceivedBeacon(dataclasses.replace(NEIGHBOUR, frame_id=0), 99.8, 99.8)
     (failed,) = failed_checks(dataclasses.replace(READY, neighbours=(neighbour,)), LIMITS)
     assert failed.code is _C.OTHER_ORIGIN
 
 
-def in_the_air(*flown_s: float | None) -> tuple[HeardBeacon, ...]:
+def in_the_air(*flown_s: float | None) -> tuple[ReceivedBeacon, ...]:
     """Neighbours from robot 2 on, each for so long."""
     return tuple(
-        HeardBeacon(
+        ReceivedBeacon(
             dataclasses.replace(
                 NEIGHBOUR, robot_id=2 + i, system_id=2 + i, state=FlightState.HOLD, armed=True,
                 flown_s=each_s, slot_height_m=9.5 + 4.5 * i, landing_point_m=(16.0 + 8.0 * i, 8.0),
@@ -431,7 +433,7 @@ def lines(
     neighbour = dataclasses.replace(
         NEIGHBOUR, landing_point_m=(landing_x_m, 8.0), gps_accuracy_m=its_accuracy_m
     )
-    heard = HeardBeacon(neighbour, 99.8, 99.8)
+    heard = ReceivedBeacon(neighbour, 99.8, 99.8)
     vehicle = structs.replace(VEHICLE, gps=own)
     inputs = dataclasses.replace(READY, vehicle=vehicle, neighbours=(heard,), errors=errors)
     failed = failed_checks(inputs, LIMITS)

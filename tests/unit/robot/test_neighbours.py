@@ -376,7 +376,7 @@ class AgainstHistory(RuleBasedStateMachine):
     @invariant()
     def beacons_are_the_newest(self) -> None:
         assert [
-            (heard.beacon, heard.heard_at_s) for heard in self.table.heard(self.now_s, 3.0)
+            (heard.beacon, heard.received_at_s) for heard in self.table.heard(self.now_s, 3.0)
         ] == [
             (sent.beacon, at_s)
             for _, (sent, at_s) in sorted(self.heard.items())
