@@ -76,11 +76,12 @@ def _group(robots: RobotGroup) -> str:
 def _bound(bound: Bound) -> str:
     sign = "≥" if type(bound).worst is min else "≤"
     limit = f"{bound.told_as} {sign} {bound.limit:.3g} {bound.unit}".rstrip()
-    begin = f"{bound.from_s:g} " if 0.0 < bound.from_s < math.inf else ""
-    end = f"to {bound.until_s:g} " if bound.until_s < math.inf else ""
-    when = f"{begin}{end}s" if end else f"from {begin}s" if begin else ""
-    if bound.after:
-        when = f'{when} after "{bound.after}"'.lstrip()
+    window = (
+        f"from {bound.from_s:g} s" if 0.0 < bound.from_s < math.inf else "",
+        f"to {bound.until_s:g} s" if bound.until_s < math.inf else "",
+        f'after "{bound.after}"' if bound.after else "",
+    )
+    when = " ".join(filter(None, window))
     return f"{limit} ({when})" if when else limit
 
 

@@ -147,7 +147,7 @@ _EACH_SECOND = range(180)
 # Noticed after 3 s at most, and set back at once.
 _SET_BACK_S = 5.0
 _RC = ("failsafe", "rc", "pilot")
-_NOBODY = "nothing happens"
+_NOTHING = "nothing happens"
 
 _FAULTS = (
     Fault(
@@ -225,7 +225,7 @@ _FAULTS = (
         bounds=(Lands(1.3), _DOWN, _OTHERS_FLY_ON),
     ),
     Fault(
-        "policy-dies", "a robot's policy gives no answer any more",
+        "policy-dies", "a robot's policy stops answering",
         "the robot holds within 1 s, until start is ordered, which is refused",
         does=(Do(do.LoopHangs("policy", EVER)), Do(do.OperatorOrders("start"), 8.0)),
         bounds=(
@@ -234,7 +234,7 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "sensor-dies", "a robot's perception gives nothing any more",
+        "sensor-dies", "a robot's perception stops",
         "the robot holds within 2 s",
         does=(Do(do.LoopHangs("perception", EVER)),),
         bounds=(
@@ -254,17 +254,17 @@ _FAULTS = (
     ),
     Fault(
         "clock-steps", "a robot's wall clock steps by an hour",
-        _NOBODY,
+        _NOTHING,
         does=(Do(do.ClockSteps(3600.0)),), bounds=_MISSION_GOES_ON,
     ),
     Fault(
         "clocks-step", "all robots' wall clocks step back by an hour, the laptop's ahead",
-        _NOBODY,
+        _NOTHING,
         does=(Do(do.ClockSteps(-3600.0)), Do(do.GroundClockSteps(3600.0))), bounds=_MISSION_GOES_ON,
         hits=0,
     ),
     Fault(
-        "second-program", "another computer says that it is one of the robots",
+        "second-program", "another computer claims to be one of the robots",
         "that one does not take off",
         does=(Do(do.SecondProgram()),), bounds=_ONE_STAYS_DOWN, phase="ready",
     ),
@@ -293,41 +293,41 @@ _FAULTS = (
     ),
     Fault(
         "link-loses-30-before", "30 % of all MAVLink messages are lost, from before takeoff on",
-        "a takeoff may have to be ordered again; who takes off flies and comes home",
+        "a takeoff may have to be ordered again; robots that take off fly and come home",
         does=(Do(do.disturb_wire(MavlinkWire(loss=0.3))),), bounds=(_ALL_HOME,), phase="ready",
         hits=0, watched_s=60.0,
     ),
     Fault(
-        "link-repeats", "MAVLink messages come twice, once 60 to 110 ms late",
+        "link-repeats", "MAVLink messages come twice, one of them 60 to 110 ms late",
         "the mission goes on, with an alarm that says so",
         does=(Do(do.disturb_wire(MavlinkWire(twice=1.0))),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "link-repeats-late", "MAVLink messages come twice, once 2 s late",
+        "link-repeats-late", "MAVLink messages come twice, one of them 2 s late",
         "the mission goes on, with an alarm that says so",
         does=(Do(do.disturb_wire(MavlinkWire(twice=1.0, late_s=(1.9, 2.1)))),),
         bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "link-reorders", "each fifth MAVLink message is overtaken, by 60 to 110 ms",
+        "link-reorders", "one in five MAVLink messages is 60 to 110 ms late, and overtaken",
         "it counts as lost; the mission goes on",
         does=(Do(do.disturb_wire(MavlinkWire(late=0.2))),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     # Radio and ground
     Fault(
-        "neighbours-silent", "robots hear nothing of each other, but the ground",
+        "neighbours-silent", "robots hear the ground, but not each other",
         "they are forgotten after 0.8 s; the mission goes on",
         does=(Do(do.RadioCut("from each other")),), bounds=(_ALL_FLY_ON,), hits=0,
     ),
     Fault(
         "neighbours-silent-before",
-        "robots hear nothing of each other before takeoff, but the ground",
+        "robots hear the ground, but not each other, before takeoff",
         "nobody takes off: they would not keep apart",
         does=(Do(do.RadioCut("from each other")),), bounds=(StaysDown(robots="all"),),
         phase="ready", hits=0, home=False,
     ),
     Fault(
-        "ground-lost", "no robot hears the ground any more, nor it them, for 10 s",
+        "ground-lost", "robots and ground do not hear each other for 10 s",
         "they hold after 3 s, and until start is ordered",
         does=(Do(do.RadioCut("from the ground")), Do(do.RadioCut("none"), 10.0)),
         bounds=(
@@ -388,7 +388,7 @@ _FAULTS = (
     ),
     Fault(
         "radio-late", "all messages come 3 s late, 1.5 to 4.5 s",
-        "a robot that has no word from the ground younger than 3 s holds; none lands",
+        "a robot without a message from the ground younger than 3 s holds; none lands",
         does=(Do(do.RadioIs(delay_s=3.0)),), bounds=(NotLandedBefore(30.0, "all"), _ALL_HOME),
         hits=0, watched_s=30.0,
     ),
@@ -404,7 +404,7 @@ _FAULTS = (
     ),
     Fault(
         "radio-corrupts", "every other message arrives with a flipped bit",
-        "it is not used; the mission goes on",
+        "it is dropped; the mission goes on",
         does=(Do(do.RadioIs(corruption=0.5)),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
@@ -447,8 +447,8 @@ _FAULTS = (
     ),
     # Positions
     Fault(
-        "gps-lost", "a robot's receiver has no fix any more",
-        "it stands within 1.1 s, and lands 2.4 s after the loss; the wind has it from 5 s",
+        "gps-lost", "a robot's receiver loses its fix",
+        "it stands within 1.1 s, and lands 2.4 s after the loss; it drifts from 5 s on",
         does=(Do(do.lose_gps()),), bounds=(_BRAKED, Lands(3.3), _DOWN, _OTHERS_FLY_ON),
         beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
     ),
@@ -474,8 +474,8 @@ _FAULTS = (
         watched_s=75.0, beyond_fence_m=ADRIFT_M,
     ),
     Fault(
-        "receiver-silent", "a robot's receiver says nothing any more",
-        "it stands 1.9 s after the receiver's last word, and lands after 3.5 s",
+        "receiver-silent", "a robot's receiver falls silent",
+        "it stands 1.9 s after the receiver's last message, and lands after 3.5 s",
         does=(Do(do.silence(SimulatedSensor.GPS)),),
         bounds=(_BRAKED_LATER, Lands(4.5), _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
         uncovered=_ADRIFT,
@@ -514,7 +514,7 @@ _FAULTS = (
     ),
     Fault(
         "receiver-stuck", "a robot's receiver repeats its last fix, with a velocity of 0",
-        "it stops within 1.5 s, lands 2 s later, and the wind has it from 5 s on",
+        "it stops within 1.5 s, lands 2 s later, and drifts from 5 s on",
         does=(Do(do.repeat_fix()),),
         bounds=(_BRAKED, Lands(3.5), _NEAR_STILL, _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
         uncovered=_ADRIFT,
@@ -528,49 +528,49 @@ _FAULTS = (
     ),
     Fault(
         "receiver-creeps", "a robot's fix walks off at 2 m/s, and its velocity is honest",
-        "it stops within 3.7 s, lands 2 s later, and the wind has it 5 s later",
+        "it stops within 3.7 s, lands 2 s later, and drifts 5 s later",
         does=(Do(do.falsify_fixes(creep_m_s=2.0)),),
         bounds=(Lands(6.5), _NEAR_STILL, _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
         uncovered=_ADRIFT,
     ),
     Fault(
-        "receiver-races", "a robot's receiver tells a velocity that is wrong by 3 m/s",
-        "it stops within 1 s, lands 5 s after the fault, and the wind has it 5 s later",
+        "receiver-races", "a robot's receiver reports a velocity that is wrong by 3 m/s",
+        "it stops within 1 s, lands 5 s after the fault, and drifts 5 s later",
         does=(Do(do.falsify_fixes(velocity_bias_m_s=3.0)),),
         bounds=(Lands(5.5), _NEAR_STILL, _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
         uncovered=_ADRIFT,
     ),
     Fault(
         "receiver-scatters", "a robot's fixes scatter by 10 m, and claim to be accurate",
-        "it stops within 1.5 s, and lands; 5 s after PX4 rejects it the wind has it",
+        "it stops within 1.5 s and lands; it drifts 5 s after PX4 rejects the fixes",
         does=(Do(do.falsify_fixes(scatter_m=10.0)),),
         bounds=(Lands(35.0), _NEAR_STILL, _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
         uncovered=_ADRIFT,
     ),
     Fault(
         "receiver-stuck-in-takeoff", "a robot's receiver repeats its fix as it climbs",
-        "it lands, and the wind has it from 5 s on",
+        "it lands, and drifts from 5 s on",
         does=(Do(do.repeat_fix(), 10.0),), bounds=(Down(60.0), _OTHERS_TAKE_OFF), phase="takeoff",
         beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
     ),
     Fault(
         "receiver-stuck-in-return", "a robot's receiver repeats its fix on its way home",
-        "it lands, and the wind has it from 5 s on",
+        "it lands, and drifts from 5 s on",
         does=(Do(do.repeat_fix()),), bounds=(_NEAR_STILL, Down(60.0), _OTHERS_HOME), phase="return",
         beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
     ),
     Fault(
-        "estimate-freezes", "a robot's autopilot tells the same position again and again",
+        "estimate-freezes", "a robot's autopilot repeats the same position",
         "it stands after 1.4 s, and lands 3 s after the freeze",
         does=(Do(do.freeze_estimate()),), bounds=(_BRAKED_LATER, Lands(4.0), _DOWN, _OTHERS_FLY_ON),
         beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
     ),
     Fault(
         "gps-drifts", "a robot's position drifts by 8 m in 40 s: more than its budget",
-        "nothing notices it, and no margin covers it: beyond the fence by so much",
+        "nothing notices it, and no margin covers it: it may leave the fence by as much",
         does=(Do(do.drift_estimate(inwards_m_s=0.2)), Do(do.drift_estimate(), 40.0)),
         bounds=(_OTHERS_FLY_ON,), watched_s=45.0, beyond_fence_m=POSITION_ERROR_M + 8.0,
-        uncovered="it comes as near to the others, and to the fence, as its error is too large",
+        uncovered="it comes nearer to the others and to the fence by its error beyond the budget",
     ),
     Fault(
         "height-drifts", "a robot's height drifts by 2 m within 40 s: its whole budget",
@@ -604,7 +604,7 @@ _FAULTS = (
         beyond_fence_m=POSITION_ERROR_M + 1.0,
     ),
     Fault(
-        "gps-lost-in-takeoff", "a robot's receiver has no fix any more while it climbs",
+        "gps-lost-in-takeoff", "a robot's receiver loses its fix while it climbs",
         "it lands",
         does=(Do(do.lose_gps(), 10.0),), bounds=(Down(60.0), _OTHERS_TAKE_OFF), phase="takeoff",
         beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
@@ -641,7 +641,7 @@ _FAULTS = (
         bounds=(MissionEnds(1.5), Lands(8.0), Down(8.0 + _LANDING_S), _OTHERS_FLY_ON),
     ),
     Fault(
-        "battery-silent", "nothing is told of a robot's battery any more",
+        "battery-silent", "a robot's battery is no longer reported",
         "an alarm; the mission goes on",
         does=(Do(do.silence(SimulatedSensor.BATTERY)),),
         bounds=(FliesOn(0.9, "all", until_s=20.0),),
@@ -673,8 +673,8 @@ _FAULTS = (
         bounds=(_SINKING_NOTICED, Lands(8.5), Down(8.5 + _LANDING_S), _OTHERS_FLY_ON),
     ),
     Fault(
-        "sinks-slowly", "a robot's motors lift a little too little: it sinks at 0.3 m/s",
-        "as one that sinks faster, but later",
+        "sinks-slowly", "a robot's motors lift slightly too little, and it sinks at 0.3 m/s",
+        "as for a robot that sinks faster, but later",
         does=(Do(_SINKS_SLOWLY),),
         bounds=(
             _SINKING_NOTICED, Lands(15.0), Down(15.0 + _LANDING_S),
@@ -718,7 +718,7 @@ _FAULTS = (
     # People
     Fault(
         "pilot-takes-it", "a pilot takes a robot by remote control, and flies it 15 s",
-        "nothing is sent to it any more; it is its own until the operator orders rejoin",
+        "nothing more is sent to it until the operator orders rejoin",
         does=(
             Do(do.pilot_flies(0.0, 0.0)), Do(do.pilot_flies(-1.0, 0.0), 2.0),
             Do(do.pilot_flies(), 8.0), Do(do.OperatorOrders("rejoin"), 15.0),
@@ -732,13 +732,13 @@ _FAULTS = (
     ),
     Fault(
         "pilot-lands-it", "a pilot takes a robot, and lands it",
-        "nothing is sent to it any more",
+        "nothing more is sent to it",
         does=(Do(do.pilot_flies()), Do(do.pilot_lands(), 6.0)),
         bounds=(FallsSilent(1.1), Down(8.0 + _LANDING_S), _OTHERS_FLY_ON), settings=(_RC,),
     ),
     Fault(
-        "ground-station-holds-it", "somebody's ground station sets PX4's hold",
-        "the program lets go: nothing is sent to it any more, until rejoin",
+        "ground-station-holds-it", "another ground station sets PX4's hold",
+        "the program lets go: nothing more is sent to it until rejoin",
         does=(Do(do.set_mode(Px4Mode.HOLD)), Do(do.OperatorOrders("rejoin"), 12.0)),
         bounds=(
             FallsSilent(1.2, until_s=11.9), Stands(from_s=3.0, until_s=20.0), NotLandedBefore(20.0),
@@ -746,8 +746,8 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "ground-station-lands-it", "somebody's ground station sets PX4's landing",
-        "it is not fought for: it lands",
+        "ground-station-lands-it", "another ground station sets PX4's landing",
+        "the robot does not fight it, and lands",
         does=(Do(do.set_mode(Px4Mode.LAND)),),
         bounds=(Lands(0.5), _STRAIGHT_DOWN, _DOWN, _OTHERS_FLY_ON),
     ),
@@ -778,7 +778,7 @@ _FAULTS = (
             FliesOn(0.9, until_s=_SET_BACK_S), Holds(_SET_BACK_S + 1.5), _OTHERS_FLY_ON,
             Down(_SET_BACK_S + 5.0 + _LANDING_S),
         ),
-        uncovered="who does not know where it is tells the others a wrong place as it comes down",
+        uncovered="a robot that is wrong about its place reports a wrong place as it comes down",
     ),
     Fault(
         "parameter-changed-before",
@@ -901,7 +901,7 @@ _FAULTS = (
     ),
     Fault(
         "pad-taken-in-flight", "a robot that landed is carried to another's pad",
-        "that one lands beside it",
+        "the other one lands beside it",
         does=(Do(do.OperatorOrders("land")), *(Do(do.carry_to_pad(), t) for t in (55.0, 60.0))),
         bounds=(_OTHERS_FLY_ON, LandsAtPad(8.0, "next")), watched_s=65.0, exact=True,
     ),
@@ -960,7 +960,7 @@ _FAULTS = (
     ),
     Fault(
         "piloted-while-it-hangs", "a control loop hangs, and a pilot takes it meanwhile",
-        "what comes back does not take it from the pilot",
+        "the loop, once back, does not take it from the pilot",
         does=(
             Do(do.LoopHangs("control", 3.0)), Do(do.pilot_flies(), 1.5), Do(do.pilot_lands(), 12.0),
         ),
@@ -998,7 +998,7 @@ _FAULTS = (
         bounds=(Lands(8.0), Down(8.0 + _LANDING_S), _OTHERS_HOME),
     ),
     Fault(
-        "gps-lost-in-return", "a robot's receiver has no fix any more on its way home",
+        "gps-lost-in-return", "a robot's receiver loses its fix on its way home",
         "it lands",
         does=(Do(do.lose_gps()),), bounds=(Down(60.0), _OTHERS_HOME), phase="return",
         beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
