@@ -31,7 +31,9 @@ def main() -> None:
             )
         except (PageError, Abort, ConfigurationError) as error:
             sys.exit(f"handbook: {error}")
-    print(f"see {out}/index.html; its search needs a server: python -m http.server -d {out}")
+    # Its links start at a server's root; nothing links to it.
+    (out / "404.html").unlink()
+    print(f"see {out}/index.html")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ _GENERATED: dict[str, Callable[[], str]] = {
 }
 _CODE_BLOCK = re.compile(r"^(`{3,}|~{3,}).*?^\1", re.S | re.M)
 _LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\])\(([^()\s]+)\)")
-_STYLE = "site.css"
+_ASSETS = ("site.css", "iframe-worker.js")
 # Copied without change.
 _COPIED = (".png", ".svg")
 # Code would bury the pages in search results.
@@ -77,7 +77,8 @@ def place(path: str) -> str:
 
 def write_pages(folder: Path) -> None:
     """Write the site's sources. Raises PageError for a broken link."""
-    shutil.copyfile(ROOT / "handbook" / _STYLE, folder / _STYLE)
+    for name in _ASSETS:
+        shutil.copyfile(ROOT / "handbook" / name, folder / name)
     waiting = [*hand_written(), *_GENERATED]
     known = set(waiting)
     while waiting:
