@@ -1,13 +1,12 @@
-"""The robot's end of a session, sent over SSH: Python 3.6 or newer, the standard library alone.
+"""Robot side of an SSH session. Sent over SSH; needs Python 3.6 and the standard library.
 
-Calls come in as JSON lines; progress and results go out. A call that has begun is carried out
-though the laptop has gone: what it does to the robot is then whole. A session ends when its input
-ends, or is silent: then the lock that it held is free again.
+Requests are JSON lines on stdin; progress and results go to stdout. A call runs to its end even if
+the laptop disconnects. The session ends, and releases its lock, when stdin closes or falls silent.
 
-Here is but what must not depend on the laptop: whether the vehicle is armed, who holds the robot,
-and the switch of releases. A release is a folder `releases/NUMBER`, with the hash of every file in
-its `manifest.json`; `current` is a symlink to the one that runs, replaced in one step. `pending`
-says that a switch is not confirmed yet: whoever takes the lock next confirms it or takes it back.
+Only what must not depend on the laptop lives here: the armed check, the lock, and the switch of
+releases. A release is a folder `releases/NUMBER` with the hash of every file in `manifest.json`.
+`current` is a symlink to the running release, replaced atomically. A file `pending` marks a switch
+that is not confirmed; the next session that takes the lock confirms or reverts it.
 """
 
 import base64
@@ -34,18 +33,18 @@ _PROPERTIES = (
     "LoadState,ActiveState,Result,NRestarts,StatusText,InvocationID,UnitFileState,"
     "ActiveEnterTimestampMonotonic"
 )
-# The robot's, whatever folder its releases are in; it can be taken when no disk can be written.
+# One lock per robot, wherever its releases are. In /run, so that a full disk does not block it.
 _LOCK = "/run/lpac-fleet.lock"
-# The laptop says something every few seconds.
+# The laptop sends a keep-alive every few seconds.
 _SILENCE_S = 12.0
-# The program says how it is four times a second.
+# The program updates its status text at 4 Hz.
 _STATUS_FRESH_S = 2.0
-# By then it must be well, and for so long without a restart.
+# Deadline for a healthy program, and how long it must stay healthy without a restart.
 _HEALTHY_S, _STEADY_S = 40.0, 2.0
 # PX4 sends heartbeats at 1 Hz.
 _HEARTBEAT_WAIT_S = 2.5
 _IP = 0x0800
-_ARMED = "the vehicle is armed by now: nothing is restarted in flight, and the switch is pending"
+_ARMED = "the vehicle was armed meanwhile: nothing restarts in flight, and the switch is pending"
 
 Result = Dict[str, Any]
 _CALLS = {}  # type: Dict[str, Callable[..., Result]]
@@ -53,17 +52,17 @@ _lock = []  # type: List[int]
 
 
 class Refused(Exception):
-    """A request that cannot or must not be carried out; one line says why, and what to do."""
+    """Refused or failed request. The message is one line: the cause, then what to do."""
 
 
 def call(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Let the laptop call this function, with arguments and a result that JSON can hold."""
+    """Expose a function to the laptop. Its arguments and result must be JSON values."""
     _CALLS[function.__name__] = function
     return function
 
 
 def serve() -> None:
-    """Answer calls from standard input until it ends or is silent."""
+    """Answer calls from stdin until it closes or falls silent."""
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     buffer = b""
     while select.select([0], [], [], _SILENCE_S)[0]:
@@ -78,7 +77,7 @@ def serve() -> None:
             except (Refused, OSError) as error:
                 _send({"error": " ".join(str(error).split())})
             except Exception as error:
-                # A mistake of ours: the one who reads it needs the place.
+                # A bug: report where.
                 place = traceback.extract_tb(error.__traceback__)[-1]
                 _send({"error": "%s: %s (line %s)" % (type(error).__name__, error, place[1])})
 
@@ -89,12 +88,15 @@ def _send(message: Result) -> None:
         while data:
             data = data[os.write(1, data) :]
     except OSError:
-        pass  # Nobody is there any more; the call goes on.
+        pass  # The laptop is gone; the call goes on.
 
 
 @call
 def run(command: List[str], timeout_s: float = 10.0) -> Result:
-    """Run a program: its exit `code`, `out`, `err`. Raises Refused if it is missing, or hangs."""
+    """Run a program; return its exit `code`, `out` and `err`.
+
+    Raises Refused if the program is missing or times out.
+    """
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -103,12 +105,12 @@ def run(command: List[str], timeout_s: float = 10.0) -> Result:
     except FileNotFoundError:
         raise Refused("the program %s is missing on the robot" % command[0]) from None
     except subprocess.TimeoutExpired:
-        raise Refused("%s did not end within %g s" % (" ".join(command[:3]), timeout_s)) from None
+        raise Refused("%s timed out after %g s" % (" ".join(command[:3]), timeout_s)) from None
     return {"code": done.returncode, "out": done.stdout, "err": done.stderr}
 
 
-def must(*command: str) -> str:
-    """Output of a program. Raises Refused unless it returns 0."""
+def check_output(*command: str) -> str:
+    """Output of a program. Raises Refused if its exit code is not 0."""
     done = run(list(command), 60.0)
     if done["code"] != 0:
         raise Refused("%s: %s" % (" ".join(command), " ".join(done["err"].split()) or "fails"))
@@ -117,7 +119,7 @@ def must(*command: str) -> str:
 
 @call
 def write(files: Dict[str, str], mode: int) -> Result:
-    """Write files, their contents in base64, and folders around them."""
+    """Write files, given in base64, and create their folders."""
     for path, content in files.items():
         os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
         write_whole(path, base64.b64decode(content), mode)
@@ -125,9 +127,9 @@ def write(files: Dict[str, str], mode: int) -> Result:
 
 
 def write_whole(path: str, data: bytes, mode: int = 0o644) -> None:
-    """Write a file that is the old one or the new one whenever the power goes.
+    """Replace a file atomically, also across a loss of power.
 
-    It is its folder's owner's, who may have put a link there for root to follow.
+    The file gets its folder's owner, who may have put a symlink in the way: root must not follow.
     """
     part, owner = path + ".part", os.stat(os.path.dirname(path))
     if os.path.lexists(part):
@@ -142,11 +144,11 @@ def write_whole(path: str, data: bytes, mode: int = 0o644) -> None:
 
 @call
 def service() -> Result:
-    """State of the unit by systemd, and the program's own last words (`status`, None if none).
+    """State of the unit from systemd, and the program's last `status`, or None.
 
-    `fresh` tells whether the program is running and said so within the last seconds.
+    `fresh`: the program is running and its status is no older than 2 s.
     """
-    lines = must("systemctl", "show", UNIT, "--no-pager", "-p", _PROPERTIES).split("\n")
+    lines = check_output("systemctl", "show", UNIT, "--no-pager", "-p", _PROPERTIES).split("\n")
     values = dict(line.split("=", 1) for line in lines if "=" in line)
     active, now_s = values.get("ActiveState", "unknown"), time.monotonic()
     started_s = int(values.get("ActiveEnterTimestampMonotonic") or 0) / 1e6
@@ -170,36 +172,36 @@ def service() -> Result:
 
 @call
 def require_disarmed(mavlink_port: int, doing: str) -> Result:
-    """Raises Refused if the vehicle is armed, as far as anybody on the robot can tell."""
+    """Raises Refused if the vehicle is known to be armed."""
     if armed(mavlink_port):
         raise Refused("the vehicle is armed: %s is refused until it is disarmed" % doing)
     return {}
 
 
 def armed(mavlink_port: int) -> bool:
-    """Whether the vehicle's motors may turn, by the robot's program or else by the vehicle itself.
+    """Whether the vehicle is armed, from the program's status or else from PX4's heartbeat.
 
-    A program that runs but has fallen silent may have an armed vehicle: its last word counts. If it
-    had lost the vehicle by then, the vehicle's own word counts first.
+    The last status counts even if it is old, since a silent program may have an armed vehicle. If
+    the program had lost the autopilot, the heartbeat takes precedence.
     """
     state = service()
     runs = state["active"] in ("active", "reloading", "deactivating")
     status = (state["status"] if runs else None) or {}  # type: Result
     if status.get("autopilot") and status.get("armed") is not None:
         return bool(status["armed"])
-    beat = hear_heartbeat(mavlink_port)["heartbeat"]
+    beat = receive_heartbeat(mavlink_port)["heartbeat"]
     return bool((status if beat is None else beat).get("armed"))
 
 
 @call
-def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Result:
-    """The first `heartbeat` of an autopilot that comes to this host's UDP port, None if none.
+def receive_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Result:
+    """Receive the first autopilot `heartbeat` at this host's UDP port; None after `wait_s`.
 
-    `sender` is the address and the port that it came from; another computer's counts only if none
-    of this one's came in that time. Whoever has the port notices nothing.
+    `sender` is its source address and port. One from another computer counts only if none came
+    from this one. A packet socket is used, so the port's owner is not disturbed.
     """
-    heard = None
-    kind = socket.SOCK_DGRAM  # IP packets, without the frames around them
+    received = None
+    kind = socket.SOCK_DGRAM  # IP packets, without link-layer headers
     with contextlib.closing(socket.socket(socket.AF_PACKET, kind, socket.htons(_IP))) as packets:
         until_s = time.monotonic() + wait_s
         while time.monotonic() < until_s:
@@ -207,15 +209,15 @@ def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Result:
             with contextlib.suppress(socket.timeout):
                 sender, data = datagram(packets.recv(65535), port)
                 beat = heartbeat(data)
-                if beat is not None and (heard is None or sender[0].startswith("127.")):
-                    heard = dict(beat._asdict(), sender=sender)
+                if beat is not None and (received is None or sender[0].startswith("127.")):
+                    received = dict(beat._asdict(), sender=sender)
                     if sender[0].startswith("127."):
                         break
-    return {"heartbeat": heard}
+    return {"heartbeat": received}
 
 
 def datagram(packet: bytes, port: int) -> Tuple[Tuple[str, int], bytes]:
-    """Sender and payload of an IPv4 packet to a UDP port; the payload of others is empty."""
+    """Sender and payload of an IPv4 packet; the payload is empty unless it is UDP to `port`."""
     header = 4 * (packet[0] & 0x0F) if packet else 0
     if header < 20 or len(packet) < header + 8 or packet[9] != socket.IPPROTO_UDP:
         return ("", 0), b""
@@ -226,7 +228,7 @@ def datagram(packet: bytes, port: int) -> Tuple[Tuple[str, int], bytes]:
 
 @call
 def send(port: int, to: List[Any], content: str) -> Result:
-    """Send a datagram, in base64, as the robot's program would: from its port, unless it has it."""
+    """Send a datagram, given in base64, from the program's own port if that is free."""
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as udp:
         with contextlib.suppress(OSError):
             udp.bind(("0.0.0.0", port))
@@ -236,10 +238,10 @@ def send(port: int, to: List[Any], content: str) -> Result:
 
 @call
 def health() -> Result:
-    """Return once the program has run well for 2 s; Refused, after 40 s, says why it does not.
+    """Return once the program has been healthy for 2 s. Raises Refused with the cause after 40 s.
 
-    Well means: systemd has it active without a restart, all its loops tick without new failures,
-    and it has joined the radio link. Vehicle, GPS and battery are preflight's matter.
+    Healthy: the unit is active without a restart, all loops tick without new failures, and the
+    radio link is open. Vehicle, GPS and battery are left to preflight.
     """
     until_s = time.monotonic() + _HEALTHY_S
     first, first_s = {}, 0.0  # type: Result, float
@@ -255,7 +257,7 @@ def health() -> Result:
                 return {}
         hopeless = now["active"] == "failed" or now["restarts"] >= restarts + 2
         if hopeless or time.monotonic() > until_s:
-            why = problem or "it runs for too short a time"
+            why = problem or "it was not healthy for long enough"
             raise Refused("%s; %s" % (why, last_words()["text"]))
         time.sleep(0.25)
 
@@ -264,7 +266,7 @@ def _problem(now: Result) -> Optional[str]:
     if now["active"] != "active":
         return "the unit is %s (%s)" % (now["active"], now["result"])
     if not now["fresh"]:
-        return "the program says nothing"
+        return "the program reports no status"
     return None if now["status"]["link"] else "the radio link is not open"
 
 
@@ -279,23 +281,23 @@ def _loop_problem(before: Result, now: Result) -> Optional[str]:
 
 @call
 def last_words() -> Result:
-    """`text`: the program's last line that says why it does not run, from the journal."""
+    """Return as `text` the last error that the program wrote to the journal."""
     shown = run(["journalctl", "-u", UNIT, "-n", "20", "-o", "cat", "--no-pager"])["out"]
     for line in reversed(shown.split("\n")):
         if line.startswith("lpac: "):
-            return {"text": "it says: %s" % line}
+            return {"text": "last error: %s" % line}
         with contextlib.suppress(ValueError):
             event = json.loads(line) if line.startswith("{") else {}
             if event.get("level") in ("error", "critical"):
-                return {"text": "it says: %s" % event.get("event")}
+                return {"text": "last error: %s" % event.get("event")}
     return {"text": "see `lpac fleet logs`"}
 
 
 @call
 def lock(directory: str, who: str, mavlink_port: int) -> Result:
-    """Hold the robot for this session alone, and finish a switch that was interrupted.
+    """Lock the robot for this session and finish an interrupted switch.
 
-    Returns what came of that (`recovered`). Raises Refused that says who has the robot.
+    Returns the result of that switch as `recovered`. Raises Refused that names the lock's holder.
     """
     descriptor = os.open(_LOCK, os.O_RDWR | os.O_CREAT, 0o600)
     try:
@@ -312,7 +314,7 @@ def lock(directory: str, who: str, mavlink_port: int) -> Result:
 
 @call
 def require_lock() -> Result:
-    """Raises Refused if this session does not hold the robot."""
+    """Raises Refused if this session does not hold the lock."""
     if not _lock:
         raise Refused("lock was not called")
     return {}
@@ -320,12 +322,12 @@ def require_lock() -> Result:
 
 @call
 def check(folder: str) -> Result:
-    """Raises Refused if a file is not what the release's manifest says, or there are others."""
+    """Raises Refused unless the folder's files are exactly those of the release's manifest."""
     try:
         with open(os.path.join(folder, "manifest.json"), "rb") as manifest:
             wanted = dict(json.loads(manifest.read().decode())["files"])
     except (ValueError, KeyError, TypeError):
-        raise Refused("manifest.json is not whole: deploy again") from None
+        raise Refused("manifest.json is damaged: deploy again") from None
     found = {}
     for parent, folders, files in os.walk(folder):
         for name in folders + files:
@@ -338,16 +340,16 @@ def check(folder: str) -> Result:
     del found["manifest.json"]
     for name in sorted(set(wanted) | set(found)):
         if wanted.get(name) != found.get(name):
-            raise Refused("%s is not what the release has: deploy again" % name)
+            raise Refused("%s differs from the release: deploy again" % name)
     return {}
 
 
 @call
 def switch(directory: str, release: str, mavlink_port: int) -> Result:
-    """Run `releases/RELEASE` if its program turns out well; else the former one again.
+    """Run `releases/RELEASE`; revert to the former release if its program is not healthy.
 
-    One without robot.toml, a spare's, becomes current and nothing is started. Raises Refused if the
-    vehicle is armed, also by then, or if the release did not run well, with the reason.
+    A release without robot.toml (a spare's) becomes current and starts nothing. Raises Refused if
+    the vehicle is armed or becomes armed, or with the reason why the release failed.
     """
     require_lock()
     check(os.path.join(directory, "releases", release))
@@ -357,34 +359,34 @@ def switch(directory: str, release: str, mavlink_port: int) -> Result:
     write_whole(os.path.join(directory, "pending"), pending.encode())
     problem = _activate(directory, release, mavlink_port)
     if problem not in (None, _ARMED):
-        back = _take_back(directory, former, mavlink_port)
-        problem = "%s does not run well (%s); %s" % (_id(directory, release), problem, back)
+        back = _revert(directory, former, mavlink_port)
+        problem = "%s failed (%s); %s" % (_id(directory, release), problem, back)
     if problem is not None:
         raise Refused(problem)
-    _settle(directory)
+    _confirm(directory)
     return {}
 
 
 def _activate(directory: str, release: str, mavlink_port: int) -> Optional[str]:
-    """Check, switch and restart; why the program does not run well then, None if it does."""
+    """Check, switch and restart. Return why the program is not healthy then, or None."""
     folder, link = os.path.join(directory, "releases", release), os.path.join(directory, "current")
     try:
         check(folder)
-        must("ln", "-sfn", os.path.join("releases", release), link + ".part")
+        check_output("ln", "-sfn", os.path.join("releases", release), link + ".part")
         os.replace(link + ".part", link)
         _sync(directory)
         _install_units(directory, folder)
         former = service()["invocation"]
-        if armed(mavlink_port):  # All of that may have taken minutes.
+        if armed(mavlink_port):  # The steps above may take minutes.
             return _ARMED
         if not os.path.exists(os.path.join(folder, "robot.toml")):
             run(["systemctl", "disable", "--now", UNIT])
             return None
         _send({"progress": "restart"})
         run(["systemctl", "reset-failed", UNIT])
-        # A program that cannot start shows in its health, with the reason.
+        # `health` reports a program that cannot start, with the reason.
         run(["systemctl", "restart", UNIT], 90.0)
-        must("systemctl", "enable", UNIT)
+        check_output("systemctl", "enable", UNIT)
         if former and service()["invocation"] == former:
             return "it was not restarted: see `systemctl status lpac-robot` on the robot"
         _send({"progress": "health"})
@@ -397,8 +399,8 @@ def _activate(directory: str, release: str, mavlink_port: int) -> Optional[str]:
 
 
 def _install_units(directory: str, folder: str) -> None:
-    """Make the release's unit files, and their drop-ins if it has any, systemd's."""
-    # The unit mounts the image over it.
+    """Install the release's unit files and drop-ins."""
+    # Mount point of the image in the unit.
     os.makedirs(os.path.join(directory, "sandbox"), mode=0o755, exist_ok=True)
     for unit in (UNIT, LAND_UNIT):
         conf = unit.replace(".service", ".conf")
@@ -410,11 +412,11 @@ def _install_units(directory: str, folder: str) -> None:
                     write_whole(target, file.read())
             elif os.path.exists(target):
                 os.unlink(target)
-    must("systemctl", "daemon-reload")
+    check_output("systemctl", "daemon-reload")
 
 
-def _take_back(directory: str, former: Optional[str], mavlink_port: int) -> str:
-    """Run the former release again; what came of it. The change is settled by that."""
+def _revert(directory: str, former: Optional[str], mavlink_port: int) -> str:
+    """Run the former release again; return the result in words."""
     if armed(mavlink_port):
         return _ARMED
     _send({"progress": "rollback"})
@@ -429,22 +431,22 @@ def _take_back(directory: str, former: Optional[str], mavlink_port: int) -> str:
             return problem
         back = "the robot runs %s again" % name
         if problem is not None:
-            back = "%s, to which it was taken back, does not run well either: %s" % (name, problem)
-    _settle(directory)
+            back = "the former release, %s, failed too: %s" % (name, problem)
+    _confirm(directory)
     return back
 
 
-def _settle(directory: str) -> None:
-    """The change is over: nothing of it is pending any more."""
+def _confirm(directory: str) -> None:
+    """Mark the switch as done."""
     _sync(directory, _UNIT_PATH)
     with contextlib.suppress(FileNotFoundError):
         os.unlink(os.path.join(directory, "pending"))
 
 
 def _recover(directory: str, mavlink_port: int) -> Optional[str]:
-    """Finish a change that a loss of power, or of its operator, left open; what came of it.
+    """Finish a switch that a loss of power or of the laptop interrupted; return the result.
 
-    Never fails, or nothing could be done to the robot any more.
+    Must never raise: the lock could not be taken any more.
     """
     current = linked(directory)
     try:
@@ -454,24 +456,23 @@ def _recover(directory: str, mavlink_port: int) -> Optional[str]:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     if current is None:
-        _settle(directory)
+        _confirm(directory)
         return None
     _send({"progress": "finish an interrupted switch"})
     name = _id(directory, current)
     problem = _ARMED if armed(mavlink_port) else _activate(directory, current, mavlink_port)
     if problem == _ARMED:
         return "a switch to %s was interrupted; %s" % (_id(directory, wanted), problem)
-    ill = "%s does not run well (%s)" % (name, problem)
-    end = ill if problem is not None else "the robot runs %s" % name
+    end = "the robot runs %s" % name if problem is None else "%s failed (%s)" % (name, problem)
     if problem is not None and current == wanted and former != current:
-        end = "%s; %s" % (end, _take_back(directory, former, mavlink_port))
+        end = "%s; %s" % (end, _revert(directory, former, mavlink_port))
     else:
-        _settle(directory)
+        _confirm(directory)
     return "an interrupted switch was finished: " + end
 
 
 def linked(directory: str) -> Optional[str]:
-    """The release that is current, None if there is none."""
+    """Number of the current release, or None."""
     try:
         return os.path.basename(os.readlink(os.path.join(directory, "current")))
     except OSError:
@@ -479,7 +480,7 @@ def linked(directory: str) -> Optional[str]:
 
 
 def _id(directory: str, release: str) -> str:
-    """A release's name by its content: the beginning of its manifest's hash."""
+    """Id of a release: the first 16 hex digits of its manifest's sha256."""
     path = os.path.join(directory, "releases", release, "manifest.json")
     return _sha256(path)[:16] if os.path.exists(path) else release
 
@@ -493,7 +494,7 @@ def _sha256(path: str) -> str:
 
 
 def _sync(*paths: str) -> None:
-    """Write out the file systems of these paths; another one's logs may take long."""
+    """Flush these paths' file systems only: flushing another one's logs may take long."""
     with contextlib.suppress(Refused):
         if run(["sync", "--file-system", *paths], 120.0)["code"] == 0:
             return

@@ -1,21 +1,21 @@
-"""A release's way to a robot: travel, be checked whole, prove itself, switch; or change nothing."""
+"""Deploy a release to a robot: send, check, verify, benchmark and switch, or change nothing."""
 
 import json
 from collections.abc import Iterable, Sequence, Set
 from typing import Any, NamedTuple
 
 from lpac.fleet.hold import Held, Report, earlier_than, hold
-from lpac.fleet.members import bring_members
+from lpac.fleet.members import send_members
 from lpac.fleet.program import require_disarmed
 from lpac.fleet.release import Release
 from lpac.fleet.session import Done, FleetError, RemoteError, Session, rsync
 from lpac.fleet.settings import FleetConfig, RobotHost
 
 _MARGIN_MB = 100.0
-# Of the policy's verification, on a slow CPU.
+# The policy's verification on a slow CPU.
 _VERIFY_S = 150.0
-# A program in a release's file system, as the unit runs it, but before any switch: as nobody, or as
-# root with a folder that it sees at /var/lib and may only read.
+# Runs lpac in the release's file system as the unit would, before any switch: as user nobody, or
+# as root with a folder mounted read-only at /var/lib.
 _INSIDE = """set -e; cd "$1/root"; state=$2; shift 2; mount --bind .. release
 user=--userspec=65534:65534
 if [ "$state" ]; then
@@ -27,7 +27,7 @@ mount -t tmpfs tmpfs tmp; exec nice -n 5 chroot "$user" . /usr/bin/lpac "$@"
 
 
 class Deployed(NamedTuple):
-    """A robot's new release, and its cost: bytes of content, and its policy's ticks, ms."""
+    """A robot's new release, the bytes sent, and the policy's measured tick times, ms."""
 
     release: str
     summary: str
@@ -37,9 +37,9 @@ class Deployed(NamedTuple):
 
 
 async def lpac_inside(session: Session, release: str, *command: str, state: str = "") -> Done:
-    """Run `lpac` of the release in that folder of the robot's, with /release as the unit has it.
+    """Run `lpac` from the release in that folder on the robot, mounted at /release as in the unit.
 
-    As nobody; or as root, where `state` is a folder that it sees at /var/lib, and cannot change.
+    Runs as nobody; with `state`, as root with that folder mounted read-only at /var/lib.
     """
     inside = ("unshare", "--mount", "sh", "-c", _INSIDE, "sh", release, state)
     return await session.run(*inside, *command, timeout_s=_VERIFY_S)
@@ -48,9 +48,9 @@ async def lpac_inside(session: Session, release: str, *command: str, state: str 
 async def deploy(
     config: FleetConfig, robot: RobotHost, release: Release, report: Report
 ) -> Deployed:
-    """Bring `release` to the robot and run it there, or leave what runs untouched.
+    """Send `release` to the robot and run it.
 
-    Raises FleetError that says what went wrong; the robot then has what it had before.
+    Raises FleetError with the cause; the robot then keeps its former release.
     """
     async with hold(config, robot, report) as held:
         before, session = held.found, held.session
@@ -65,11 +65,11 @@ async def deploy(
         if before["current"] == release.id and before["pending"] is None and runs:
             report("check", None)
             if await _is_whole(session, f"{config.directory}/current/"):
-                await bring_members(session, config)
+                await send_members(session, config)
                 return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
         incoming = f"{config.directory}/incoming/{release.id}"
         kept = await _make_room(session, config, release, before, incoming)
-        await bring_members(session, config)
+        await send_members(session, config)
         like = [f"--link-dest={config.directory}/releases/{name}" for name in kept]
         sent_bytes = await _send(config, robot, release, held, incoming, like, report)
         steps = await _prove(session, release, incoming, report)
@@ -92,26 +92,26 @@ async def _is_whole(session: Session, folder: str) -> bool:
 async def _make_room(
     session: Session, config: FleetConfig, release: Release, found: dict[str, Any], incoming: str
 ) -> set[str]:
-    """Make the folder to fill; what came of this release before it broke off is still there.
+    """Prepare `incoming`, keeping what an interrupted transfer left, and return the kept releases.
 
-    The releases that are kept meanwhile. Raises RemoteError if the disk has no room.
+    Raises RemoteError if the disk has no room.
     """
     number, current = found["number"], f"{config.directory}/current/manifest.json"
     if number is None and (await session.run("test", "-e", current)).code == 0:
-        raise RemoteError("its current release was not read, so that none is removed: try again")
-    await session.must("mkdir", "-p", incoming, f"{config.directory}/releases")
+        raise RemoteError("its current release cannot be read, so none is removed: try again")
+    await session.check_output("mkdir", "-p", incoming, f"{config.directory}/releases")
     others = ("-mindepth", "1", "-maxdepth", "1", "!", "-name", release.id, "-exec", "rm", "-rf")
-    await session.must("find", f"{config.directory}/incoming", *others, "{}", "+")
-    # One that did not run well may be left, or that a rollback left behind.
+    await session.check_output("find", f"{config.directory}/incoming", *others, "{}", "+")
+    # A newer one may be left from a failed switch or a rollback.
     names = found["releases"]
     newer = next((name for name in names if name != number), None)
     kept = {number, earlier_than(number, names) or newer} - {None}
     await _keep(session, config, names, kept)
-    came = await session.must("du", "-sb", incoming)
-    free = await session.must("df", "-B1", "--output=avail", incoming)
+    received = await session.check_output("du", "-sb", incoming)
+    free = await session.check_output("df", "-B1", "--output=avail", incoming)
     needed_mb = _MARGIN_MB
     if not any(names[name]["image"] == release.image.id for name in kept):
-        needed_mb += max(0.0, release.size_bytes - float(came.split()[0])) / 1e6
+        needed_mb += max(0.0, release.size_bytes - float(received.split()[0])) / 1e6
     free_mb = float(free.split()[-1]) / 1e6
     if free_mb < needed_mb:
         raise RemoteError(
@@ -130,34 +130,34 @@ async def _send(
     like: Sequence[str],
     report: Report,
 ) -> int:
-    """Have the release in `incoming`; how many bytes of content travelled.
+    """Send the release to `incoming`; return the bytes of content sent.
 
-    `like` are rsync's options for releases on the robot: files that are whole there are linked to.
+    `like` are rsync's --link-dest options: files that the kept releases have are hard-linked.
     """
     try:
         return await rsync(
             config, robot, [f"{release.folder}/", str(release.image.folder)], f":{incoming}/",
-            # Of folders; files keep their modes, which the manifest has.
+            # Folders only: the manifest has the files' modes.
             options=["--delete", "--partial", "--chmod=Du=rwx,Dgo=rx", *like],
             sudo=held.found["sudo"], on_share=lambda share: report("send", share),
         )  # fmt: skip
     except FleetError as error:
         if "disk is full" in str(error):
-            await held.session.must("rm", "-rf", incoming)
+            await held.session.check_output("rm", "-rf", incoming)
         raise
 
 
 async def _prove(
     session: Session, release: Release, incoming: str, report: Report
 ) -> dict[str, Any]:
-    """Check every file that has come, run the policy's own verification, and time it on this CPU.
+    """Check every file, verify the policy's golden outputs, and benchmark it on this CPU.
 
-    Raises RemoteError if a file is not whole, the policy does not compute what it must, or is slow.
+    Raises RemoteError if a file differs, an output is wrong, or the policy is too slow.
     """
     report("check", None)
-    manifest = await session.must("sha256sum", f"{incoming}/manifest.json")
+    manifest = await session.check_output("sha256sum", f"{incoming}/manifest.json")
     if not manifest.startswith(release.id):
-        raise RemoteError("the manifest that came is not the release's: deploy again")
+        raise RemoteError("the manifest was damaged in transfer: deploy again")
     await session.call("check", folder=incoming)
     bundle = ("/release/bundle", "--json")
     commands = (("verify", *bundle), ("benchmark", *bundle, "--seconds", "1"))
@@ -165,7 +165,7 @@ async def _prove(
         report(command[0], None)
         done = await lpac_inside(session, incoming, "bundle", *command)
         if done.code != 0 and command[0] == "benchmark":
-            # Something else may have run beside the first.
+            # Another process may have disturbed the first run.
             done = await lpac_inside(session, incoming, "bundle", *command)
         if done.code != 0:
             raise RemoteError(f"bundle {command[0]} on the robot: {done.reason}")
@@ -182,12 +182,12 @@ async def _switch(
     kept: Set[str],
     incoming: str,
 ) -> None:
-    """Run the release that has come; of those that were `kept`, keep the one before it."""
+    """Run the received release; of those in `kept`, keep only the one before it."""
     releases = before["releases"]
     number = max([release.number, *(int(name) + 1 for name in releases if name.isdigit())])
     place = f"{config.directory}/releases"
-    await session.must("sync", "--file-system", place, timeout_s=120.0)
-    await session.must("mv", "--no-target-directory", incoming, f"{place}/{number}")
+    await session.check_output("sync", "--file-system", place, timeout_s=120.0)
+    await session.check_output("mv", "--no-target-directory", incoming, f"{place}/{number}")
     await session.call("switch", directory=config.directory, release=str(number),
                        mavlink_port=robot.mavlink_port)  # fmt: skip
     same = before["current"] == release.id
@@ -198,17 +198,17 @@ async def _switch(
 async def _keep(
     session: Session, config: FleetConfig, names: Iterable[str], kept: Set[str | None]
 ) -> None:
-    """Remove the other releases of these names."""
+    """Remove all releases of `names` but those in `kept`."""
     gone = [name for name in names if name not in kept]
     if gone:
-        # What is removed by half is no release any more.
+        # Moved first, so that a half-removed folder is not taken for a release.
         incoming, place = f"{config.directory}/incoming", f"{config.directory}/releases"
-        await session.must("mv", "-t", incoming, *(f"{place}/{name}" for name in gone))
-        await session.must("rm", "-rf", *(f"{incoming}/{name}" for name in gone))
+        await session.check_output("mv", "-t", incoming, *(f"{place}/{name}" for name in gone))
+        await session.check_output("rm", "-rf", *(f"{incoming}/{name}" for name in gone))
 
 
 async def rollback(config: FleetConfig, robot: RobotHost, report: Report) -> str:
-    """Run the release before the current one again; its id. Raises FleetError."""
+    """Run the release before the current one; return its id. Raises FleetError."""
     async with hold(config, robot, report) as (session, found, _):
         await require_disarmed(session, robot, "rolling back")
         name = earlier_than(found["number"], found["releases"])

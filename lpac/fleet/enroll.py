@@ -1,7 +1,6 @@
-"""Making a computer a robot of the fleet: each step is done, or was so already.
+"""Enroll a computer as a robot of the fleet, in steps that may be repeated.
 
-The first step logs in as a person does, since only that person can: OpenSSH itself asks for the
-password, and whether the host key is the right one.
+The first step lets OpenSSH itself ask for the password and about the host key.
 """
 
 import re
@@ -20,23 +19,24 @@ from lpac.fleet.members import Joined, join
 from lpac.fleet.release import load_common, make_release
 from lpac.fleet.session import (
     FleetError,
+    OnProgress,
     RemoteError,
     UnreachableError,
     connect,
     explain,
     ssh_command,
 )
-from lpac.fleet.settings import FleetConfig, RobotHost, is_of_computer, load_fleet
+from lpac.fleet.settings import FleetConfig, RobotHost, is_host_address, load_fleet
 from lpac.fleet.setup import (
-    EnrolStep,
-    retire,
+    EnrollStep,
     set_identity,
     set_up_px4,
     set_vision_hub,
+    stop_predecessors,
 )
 from lpac.fleet.writer import add_robot
 
-# As ssh-copy-id does it; the key comes on standard input.
+# As ssh-copy-id does; the keys come on stdin.
 _INSTALL_KEYS = """exec sh -c '
 cd && umask 077 && mkdir -p .ssh && touch .ssh/authorized_keys || exit 1
 file=.ssh/authorized_keys
@@ -44,12 +44,9 @@ file=.ssh/authorized_keys
 while read -r key; do grep -qxF "$key" $file || echo "$key" >> $file; done
 '"""
 _LOGIN_S = 30.0
-
-
 _VOXL2_URL = "udpin://127.0.0.1:14551"
 
-OnStep = Callable[[EnrolStep], None]
-Say = Callable[[str], None]
+OnStep = Callable[[EnrollStep], None]
 
 
 async def enroll(
@@ -64,54 +61,54 @@ async def enroll(
     rename: bool,
     operator: Callable[[], str],
     on_step: OnStep,
-    say: Say,
+    on_progress: OnProgress,
 ) -> None:
-    """Enroll the computer at `host` in the fleet of the file; a robot that is new is a spare.
+    """Enroll the computer at `host` in the fleet of the file; a new robot becomes a spare.
 
-    Of a robot that the file has, all about it follows from the file. A new robot without a `user`
-    is root's, without an `address` has the one that its host name has here, and without a
-    `robot_id` has the number in its name.
+    For a robot that is in the file, everything follows from the file. For a new one, `user`
+    defaults to root, `address` to what its host name resolves to here, and `robot_id` to the number
+    in its name.
 
-    `on_step` hears of every step, `say` what is being done. `rename` lets a robot that is enrolled
-    as another one become this one. The first robot makes the fleet's authority, with `operator` as
-    this computer's name. Raises ConfigError, AuthorityError or FleetError at the first step that
-    fails.
+    `on_step` gets the result of every step, `on_progress` what is being done. `rename` allows a
+    robot that is enrolled under another name. The first robot creates the fleet's authority, with
+    `operator()` as this computer's name. Raises ConfigError, AuthorityError or FleetError at the
+    first step that fails.
     """
     config = load_fleet(path)
     robot = _robot(config, name, host, user, port, address, robot_id)
     on_step(_key(config, robot))
-    async with connect(config, robot, say) as session:
+    async with connect(config, robot, on_progress) as session:
         found = (await overview(session, config))["identity"]
         await lock(session, config, robot)
         former = other_identity(found, config, robot)
         if former is not None and not rename:
-            raise RemoteError(f"it is enrolled as {former}: if it is to be {name}, add --yes")
-        was_there = name in config.robots
-        if not was_there:
+            raise RemoteError(f"it is enrolled as {former}: to make it {name}, add --yes")
+        is_new = name not in config.robots
+        if is_new:
             add_robot(
                 path, name, robot.host, robot.robot_id, user=robot.user, port=port,
                 address=robot.address if robot.address != robot.host else None,
             )  # fmt: skip
             config = load_fleet(path)
             robot = config.robots[name]
-        on_step(EnrolStep.of(path.name, not was_there))
+        on_step(EnrollStep.of(path.name, is_new))
         on_step(await set_identity(session, config, robot, found))
         on_step(_member_step(config, await join(session, config, robot, operator)))
         on_step(await set_vision_hub(session, robot))
-        on_step(await retire(session, robot, config.predecessors, say))
-    step = await _release(config, robot, say)
+        on_step(await stop_predecessors(session, robot, config.predecessors, on_progress))
+    step = await _release(config, robot, on_progress)
     on_step(step)
     if step.outcome == "left to do":
         on_step(
-            EnrolStep("PX4", "left to do", ("the release sets it up: enroll again after that",))
+            EnrollStep("PX4", "left to do", ("needs the release: enroll again after deploying",))
         )
         return
-    async with connect(config, robot, say) as session:
+    async with connect(config, robot, on_progress) as session:
         await lock(session, config, robot)
         try:
-            on_step(await set_up_px4(session, config, robot, say))
+            on_step(await set_up_px4(session, config, robot, on_progress))
         except RemoteError as error:
-            on_step(EnrolStep("PX4", "left to do", (f"{error}; then enroll again",)))
+            on_step(EnrollStep("PX4", "left to do", (f"{error}; then enroll again",)))
 
 
 def _robot(
@@ -123,31 +120,31 @@ def _robot(
     address: str | None,
     robot_id: int | None,
 ) -> RobotHost:
-    """The robot of the file, or one that it does not have yet."""
+    """The file's robot of that name, or a new one. Raises ConfigError or UnreachableError."""
     known = config.robots.get(name)
     if known is not None:
         given = {"host": host, "user": user, "port": port, "address": address, "robot_id": robot_id}
         for key, value in given.items():
             has = getattr(known, key)
             if value not in (None, has):
-                stands = f"{key} = {has!r}" if has is not None else f"no {key}"
+                present = f"{key} = {has!r}" if has is not None else f"no {key}"
                 raise ConfigError(
-                    f"{config.path}: robots.{name}: has {stands}: change it there, or leave "
+                    f"{config.path}: robots.{name}: has {present}: change it there, or leave "
                     f"{value!r} out"
                 )
         return known
     if host is None:
-        raise ConfigError(f"{config.path}: robots.{name}: is not there: give its address")
-    # Before anything is sent there.
+        raise ConfigError(f"{config.path}: robots.{name}: does not exist yet: give its address")
+    # Before it gets on a command line.
     require_host("HOST", host)
-    if not (address is None or is_of_computer(address)):
+    if not (address is None or is_host_address(address)):
         raise ConfigError(f"--address {address!r}: must be a computer's own IPv4 address")
     if robot_id is None:
         number = re.search(r"\d+", name)
         if number is None:
-            raise ConfigError(f"{config.path}: robots.{name}: no number in it: give --robot-id")
+            raise ConfigError(f"{config.path}: robots.{name}: has no number: give --robot-id")
         robot_id = int(number[0])
-    # A file without it is refused when the robot is added.
+    # The file is checked when the robot is added.
     url = config.shared.get("autopilot", {}).get("url", _VOXL2_URL)
     robot = RobotHost(
         name=name, host=host, user=user or "root", port=port, address=address or host,
@@ -160,22 +157,19 @@ def _robot(
         return replace(robot, address=socket.gethostbyname(named))
     except OSError:
         raise UnreachableError(
-            f"{named}: has no IPv4 address here: give the one that the other robots know with "
+            f"{named}: has no IPv4 address here: give the one that the other robots reach with "
             "--address"
         ) from None
 
 
-# The key
-
-
-def _key(config: FleetConfig, robot: RobotHost) -> EnrolStep:
-    """Let this operator's keys in, with a person's login if need be."""
+def _key(config: FleetConfig, robot: RobotHost) -> EnrollStep:
+    """Install this operator's ssh keys, asking for the password if need be."""
     problem = _login_problem(config, robot)
     if problem is None:
-        return EnrolStep("key", "was so already")
+        return EnrollStep("key", "was so already")
     keys = _public_keys(config, robot)
     if not keys:
-        raise FleetError("there is no key of yours to install: make one with ssh-keygen")
+        raise FleetError("you have no ssh key to install: make one with ssh-keygen")
     command = [
         "BatchMode=no" if part == "BatchMode=yes" else part for part in ssh_command(config, robot)
     ]
@@ -185,15 +179,15 @@ def _key(config: FleetConfig, robot: RobotHost) -> EnrolStep:
     problem = _login_problem(config, robot)
     if problem is not None:
         raise UnreachableError(
-            f"your key is installed, and still: {problem}; a key with a passphrase needs ssh-add"
+            f"your key is installed, but {problem}; a key with a passphrase needs ssh-add"
         )
-    return EnrolStep("key", "done")
+    return EnrollStep("key", "done")
 
 
 def _login_problem(config: FleetConfig, robot: RobotHost) -> str | None:
-    """Why a login without a question is not possible where a person's may be; None if it is.
+    """Why a login without prompts fails; None if it succeeds.
 
-    Raises UnreachableError where a person's is not either.
+    Raises UnreachableError if an interactive login would fail too.
     """
     try:
         done = subprocess.run(
@@ -205,17 +199,17 @@ def _login_problem(config: FleetConfig, robot: RobotHost) -> str | None:
     if done.returncode == 0:
         return None
     problem = explain(done.stderr, robot.host)
-    a_person_may = "Permission denied" in done.stderr or (
+    may_prompt = "Permission denied" in done.stderr or (
         "Host key verification failed" in done.stderr
         and "IDENTIFICATION HAS CHANGED" not in done.stderr
     )
-    if not a_person_may:
+    if not may_prompt:
         raise UnreachableError(f"{robot.host}: {problem}")
     return problem
 
 
 def _public_keys(config: FleetConfig, robot: RobotHost) -> str:
-    """Content of authorized_keys: the agent's keys, and those that ssh would use here."""
+    """Lines for authorized_keys: the agent's keys, and those that ssh would use for this host."""
     lines = []
     options = _ssh_options(config, robot)
     if options.get("identitiesonly") != ["yes"]:
@@ -230,7 +224,7 @@ def _public_keys(config: FleetConfig, robot: RobotHost) -> str:
 
 
 def _ssh_options(config: FleetConfig, robot: RobotHost) -> dict[str, list[str]]:
-    """Read OpenSSH's configuration of this host."""
+    """OpenSSH's options for this host, by name."""
     *command, host = ssh_command(config, robot)
     done = subprocess.run([*command, "-G", host], capture_output=True, text=True, check=False)
     if done.returncode != 0:
@@ -242,38 +236,35 @@ def _ssh_options(config: FleetConfig, robot: RobotHost) -> dict[str, list[str]]:
     return options
 
 
-# The other steps
-
-
-async def _release(config: FleetConfig, robot: RobotHost, say: Say) -> EnrolStep:
-    """A release without a slot's configuration, unless there is any: nothing is started by it."""
-    async with connect(config, robot, say) as session:
+async def _release(config: FleetConfig, robot: RobotHost, on_progress: OnProgress) -> EnrollStep:
+    """Deploy a spare's release, which starts nothing, unless the robot has a release."""
+    async with connect(config, robot, on_progress) as session:
         if (await overview(session, config))["current"] is not None:
-            return EnrolStep("release", "was so already")
+            return EnrollStep("release", "was so already")
     try:
         common = load_common(config)
     except (ValueError, OSError) as error:
-        return EnrolStep("release", "left to do", (str(error),))
+        return EnrollStep("release", "left to do", (str(error),))
     config = replace(config, slots=())
     with tempfile.TemporaryDirectory(prefix="lpac-enroll-") as folder:
         release = make_release(config, robot, common, Path(folder))
 
         def report(step: str, share: float | None) -> None:
-            say(step if share is None else f"{step} {100.0 * share:.0f} %")
+            on_progress(step if share is None else f"{step} {100.0 * share:.0f} %")
 
         await deploy(config, robot, release, report)
-    return EnrolStep("release", "done", ("as a spare's: nothing was started",))
+    return EnrollStep("release", "done", ("as a spare: nothing was started",))
 
 
-def _member_step(config: FleetConfig, joined: Joined) -> EnrolStep:
+def _member_step(config: FleetConfig, joined: Joined) -> EnrollStep:
     if joined.outcome is None:
-        why = "insecure = true: whoever is on the network can fly it" if config.insecure else ""
-        return EnrolStep("member", "skipped", (why,) if why else ())
+        why = "insecure = true: anyone on the network can fly it" if config.insecure else ""
+        return EnrollStep("member", "skipped", (why,) if why else ())
     notes: tuple[str, ...] = ()
     if joined.new_authority is not None:
         notes = (
             f"made the fleet's keys: {joined.new_authority}",
-            "keep a copy of that folder where nobody else can read it: whoever has it can fly the "
-            "fleet, and without it no robot joins",
+            "keep a copy of that folder where nobody else can read it: anyone who has it can fly "
+            "the fleet, and without it no robot can join",
         )
-    return EnrolStep("member", joined.outcome, notes)
+    return EnrollStep("member", joined.outcome, notes)

@@ -1,4 +1,4 @@
-"""A robot for one operator alone: the right one, and nobody else changes it meanwhile."""
+"""Sessions with the right robot, with or without its lock."""
 
 import contextlib
 import getpass
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from lpac.fleet.session import RemoteError, Session, connect
 from lpac.fleet.settings import FleetConfig, RobotHost
 
-# The step, and the share of it that is done where that is known.
+# Called with a step and the share of it that is done (0 to 1), None if unknown.
 Report = Callable[[str, float | None], None]
 
 _OVERVIEW = {
@@ -30,14 +30,14 @@ _OVERVIEW = {
 
 
 class Visit(NamedTuple):
-    """A session with the right robot, and what was on it."""
+    """Session with a robot, and its `overview`."""
 
     session: Session
     found: dict[str, Any]
 
 
 class Held(NamedTuple):
-    """A session that has the robot's lock, what was on the robot, and what `lock` mended there."""
+    """Session that holds the robot's lock, its `overview`, and the result of `lock`."""
 
     session: Session
     found: dict[str, Any]
@@ -45,41 +45,41 @@ class Held(NamedTuple):
 
 
 async def overview(session: Session, config: FleetConfig) -> dict[str, Any]:
-    """State of the robot: its identity, releases, versions, unit, disk and clock.
+    """State of the robot: identity, releases, versions, unit and clock.
 
-    `releases` are by number, the newest first: their ids, images, and whether a program starts
-    (`starts`). `current`, `earlier` and `pending` are ids: of what runs, of what a rollback goes
-    back to, and of the one whose switch is not confirmed. `number` is the current one's.
+    `releases` maps numbers, the newest first, to `id`, `image`, and `starts` (it has a program to
+    start). `current`, `earlier` (the target of a rollback) and `pending` (a switch that is not
+    confirmed) are ids. `number` is the current release's.
     """
     prefix = f"cd {config.directory} || cd /; "
-    said = await session.look({name: prefix + text for name, text in _OVERVIEW.items()})
-    ids = {_name(path): digest[:16] for digest, path in _pairs(said["manifests"], "  ")}
-    images = {_name(path): text.split('"')[3] for path, text in _pairs(said["images"], ":")}
-    starts = {_name(path) for path in said["starts"].split()}
+    output = await session.capture({name: prefix + text for name, text in _OVERVIEW.items()})
+    ids = {_name(path): digest[:16] for digest, path in _pairs(output["manifests"], "  ")}
+    images = {_name(path): text.split('"')[3] for path, text in _pairs(output["images"], ":")}
+    starts = {_name(path) for path in output["starts"].split()}
     releases = {
         name: {"id": ids[name], "image": images.get(name), "starts": name in starts}
         for name in sorted(ids, key=_number, reverse=True)
     }
-    current, pending = said["current"].rpartition("/")[2], _object(said["pending"])
+    current, pending = output["current"].rpartition("/")[2], _object(output["pending"])
     earlier = earlier_than(current, releases)
     return {
-        "identity": _object(said["identity"]),
-        "machine": said["machine"],
-        "sudo": bool(said["sudo"]),
+        "identity": _object(output["identity"]),
+        "machine": output["machine"],
+        "sudo": bool(output["sudo"]),
         "current": ids.get(current),
         "number": current if current in ids else None,
         "earlier": ids[earlier] if earlier and {current, earlier} <= starts else None,
         "pending": pending and ids.get(pending["release"], pending["release"]),
         "releases": releases,
-        "versions": _object(said["versions"]),
-        "robot_toml": said["robot_toml"].partition(" ")[0] or None,
+        "versions": _object(output["versions"]),
+        "robot_toml": output["robot_toml"].partition(" ")[0] or None,
         "service": await session.call("service"),
-        "unix_time_s": float(said["unix_time_s"]),
+        "unix_time_s": float(output["unix_time_s"]),
     }
 
 
 def earlier_than(number: str | None, releases: Mapping[str, object]) -> str | None:
-    """The newest release that is older than one, None if there is none."""
+    """Newest release that is older than `number`, or None."""
     names = list(releases)
     return next(iter(names[names.index(number) + 1 :]), None) if number in names else None
 
@@ -98,7 +98,7 @@ def _number(name: str) -> int:
 
 
 def _object(text: str) -> dict[str, Any] | None:
-    """A JSON object, None if it is none."""
+    """Parse a JSON object; None if it is not one."""
     try:
         found = json.loads(text)
     except ValueError:
@@ -110,7 +110,10 @@ def _object(text: str) -> dict[str, Any] | None:
 async def visit(
     config: FleetConfig, robot: RobotHost, report: Report = lambda *_: None
 ) -> AsyncIterator[Visit]:
-    """Look at the robot without holding it. Raises FleetError if another one answers, or none."""
+    """Open a session without the lock.
+
+    Raises FleetError if the robot does not answer or another one does.
+    """
     report("connect", None)
     async with connect(config, robot, lambda step: report(step, None)) as session:
         found = await overview(session, config)
@@ -122,9 +125,9 @@ async def visit(
 async def hold(
     config: FleetConfig, robot: RobotHost, report: Report = lambda *_: None
 ) -> AsyncIterator[Held]:
-    """Hold the robot; a switch of releases that was interrupted is finished first.
+    """Open a session with the lock; an interrupted switch of releases is finished first.
 
-    Raises FleetError if it does not answer, another robot does, or somebody else holds it.
+    Raises FleetError if the robot does not answer, another one does, or it is locked.
     """
     async with visit(config, robot, report) as (session, found):
         recovered = await lock(session, config, robot)
@@ -133,7 +136,7 @@ async def hold(
 
 
 async def lock(session: Session, config: FleetConfig, robot: RobotHost) -> str | None:
-    """Take the robot's lock until the session ends; what an interrupted switch came to, if any."""
+    """Take the robot's lock until the session ends; return the result of an interrupted switch."""
     locked = await session.call(
         "lock",
         directory=config.directory,
@@ -147,7 +150,7 @@ async def lock(session: Session, config: FleetConfig, robot: RobotHost) -> str |
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # its uid has no name, as in a container
+    except (KeyError, OSError):  # The uid has no name, as in a container.
         return f"uid {os.getuid()}"
 
 
@@ -163,25 +166,25 @@ def check_identity(
 def wrong_identity(
     identity: dict[str, object] | None, config: FleetConfig, robot: RobotHost
 ) -> tuple[str, str] | None:
-    """Describe who answers instead of the robot, and what to do; None if the robot does."""
+    """Which other robot answers, and what to do; None if the right one answers."""
     if identity is None:
         return "it is not enrolled", f"run `lpac fleet enroll {robot.name} {robot.host}` once"
     other = other_identity(identity, config, robot)
     if other is None:
         return None
-    fix = f"mend the host in {config.path.name}, or enroll it"
+    fix = f"correct the host in {config.path.name}, or enroll it"
     return f"at {robot.host} answers {other}", fix
 
 
 def other_identity(
     identity: dict[str, object] | None, config: FleetConfig, robot: RobotHost
 ) -> str | None:
-    """Words for an identity that is not the robot's; None if it is, or there is none."""
+    """Describe an identity that is not the robot's; None if it is, or there is none."""
     if identity is None or identity == identity_of(config, robot):
         return None
     return "{} of fleet {} (id {})".format(*map(identity.get, ("robot", "fleet", "robot_id")))
 
 
 def identity_of(config: FleetConfig, robot: RobotHost) -> dict[str, object]:
-    """Identity of the robot, as it is written on it."""
+    """Identity as written to the robot's /etc/lpac/robot.json."""
     return {"fleet": config.fleet, "robot": robot.name, "robot_id": robot.robot_id}

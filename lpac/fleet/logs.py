@@ -1,4 +1,4 @@
-"""The robots' journals: what the program, and systemd about it, wrote and when."""
+"""Journal entries of the robot's units."""
 
 import json
 import shlex
@@ -12,14 +12,14 @@ from lpac.fleet.settings import FleetConfig, RobotHost
 
 
 class Entry(NamedTuple):
-    """One entry of a robot's journal, at the robot's time."""
+    """Journal entry, stamped by the robot's clock."""
 
     unix_time_s: float
     text: str
 
 
 def journal_command(lines: int, *, follow: bool) -> list[str]:
-    """The robot's command that prints the unit's last entries, and with `follow` those to come."""
+    """Command that prints the units' last entries; with `follow`, also new ones."""
     return [
         "journalctl", "--quiet", "--no-pager", "--all", "--unit", "lpac-robot.service",
         "--unit", "lpac-land.service",
@@ -35,23 +35,23 @@ async def read_journal(
     *,
     follow: bool,
 ) -> None:
-    """Hand each entry, and the robot's name, to `on_entry`. Raises RemoteError."""
-    complaints: list[str] = []
+    """Pass each entry and the robot's name to `on_entry`. Raises RemoteError."""
+    errors: list[str] = []
     command = as_root(shlex.join(journal_command(lines, follow=follow)))
 
     def on_output(line: str) -> None:
         on_entry(parse_entry(line), robot.name)
 
-    if await execute(config, robot, command, on_output, complaints.append) != 0:
-        raise RemoteError(complaints[-1] if complaints else "journalctl failed")
+    if await execute(config, robot, command, on_output, errors.append) != 0:
+        raise RemoteError(errors[-1] if errors else "journalctl failed")
 
 
 def parse_entry(line: str) -> Entry:
-    """The entry in a line of journalctl's JSON. Raises ValueError if it is none."""
+    """Parse a line of journalctl's JSON. Raises ValueError."""
     try:
         fields = json.loads(line)
         text = fields.get("MESSAGE") or ""
-        if isinstance(text, list):  # it is no UTF-8, or too long
+        if isinstance(text, list):  # not UTF-8, or too long
             text = bytes(text).decode(errors="replace")
         return Entry(int(fields["__REALTIME_TIMESTAMP"]) / 1e6, str(text))
     except (KeyError, TypeError, AttributeError, ValueError):
@@ -59,7 +59,7 @@ def parse_entry(line: str) -> Entry:
 
 
 def readable(entry: Entry) -> str:
-    """The time here, and the text; of a structured line `level event key=value`."""
+    """Local time and text; a structured line becomes `level event key=value`."""
     time_of_day = datetime.fromtimestamp(entry.unix_time_s).strftime("%H:%M:%S")
     return f"{time_of_day} {_readable_text(entry.text)}"
 

@@ -1,4 +1,4 @@
-"""The fleet's members: robots, whose keys stay on them, and ground stations."""
+"""Membership of the fleet's robots. A robot's secret key is made on it and never leaves."""
 
 import base64
 import hashlib
@@ -22,23 +22,26 @@ from lpac.fleet.program import require_disarmed, restart
 from lpac.fleet.session import RemoteError, Session
 from lpac.fleet.settings import FleetConfig, RobotHost
 
-# As `edge.drivers.identity_folder` reads it; the program sees it below /var/lib/lpac. The names
-# are as systemd makes them for a DynamicUser=.
+# Read by `edge.drivers.identity_folder`, below /var/lib/lpac. The host's path is as systemd has it
+# for a unit with DynamicUser=.
 _IDENTITY = "/var/lib/private/lpac/identity"
 _NEXT_KEY, _NEXT_CERTIFICATE = "next-key.pem", "next-certificate.pem"
 
 
 class Joined(NamedTuple):
-    """Outcome for a robot's membership; None: the fleet has no keys."""
+    """Result of `join`; `outcome` is None in a fleet without keys.
+
+    `new_authority` is the folder of keys, if this robot was the first.
+    """
 
     outcome: Literal["done", "was so already"] | None
     new_authority: Path | None
 
 
 def init(config: FleetConfig, operator: str) -> Authority:
-    """Make the fleet's authority, and this computer an operator's.
+    """Create the fleet's authority, with this computer as an operator.
 
-    Raises AuthorityError if the fleet has one here, or needs none; OSError.
+    Raises AuthorityError if there is one here or the fleet needs none, or OSError.
     """
     authority = create_authority(_folder(config), config.fleet)
     new_member(authority, authority.folder, Role.OPERATOR, operator)
@@ -46,13 +49,13 @@ def init(config: FleetConfig, operator: str) -> Authority:
 
 
 def open_authority(config: FleetConfig) -> Authority:
-    """The fleet's authority. Raises AuthorityError."""
+    """Open the fleet's authority. Raises AuthorityError."""
     return Authority(_folder(config), config.fleet)
 
 
 def _folder(config: FleetConfig) -> Path:
     if config.keys is None:
-        why = "insecure = true" if config.insecure else "all of it is on this computer"
+        why = "insecure = true" if config.insecure else "it runs on this computer alone"
         raise AuthorityError(f"{config.path}: fleet {config.fleet} has no keys: {why}")
     return config.keys
 
@@ -60,10 +63,10 @@ def _folder(config: FleetConfig) -> Path:
 async def join(
     session: Session, config: FleetConfig, robot: RobotHost, operator: Callable[[], str]
 ) -> Joined:
-    """See that the robot is a member with the key that is on it; the session has its lock.
+    """Make the robot a member with its own key. The session must hold the robot's lock.
 
-    The first robot makes the authority, with `operator` as this computer's name.
-    Raises FleetError, also if it is no member yet and flies, AuthorityError or OSError.
+    The first robot creates the authority, with `operator()` as this computer's name. Raises
+    FleetError (also if the robot is not a member yet and is armed), AuthorityError or OSError.
     """
     if config.keys is None:
         return Joined(None, None)
@@ -75,16 +78,16 @@ async def join(
     if knows and {KEY_PEM, MEMBERS} <= digests.keys():
         member = _member(robot, await _public_key(session, fresh=False))
         if member in authority.members.members:
-            await bring_members(session, config)
+            await send_members(session, config)
             return Joined("was so already", new)
     await _admit(session, authority, robot, fresh=False)
     return Joined("done", new)
 
 
 async def renew_key(config: FleetConfig, robot: RobotHost, report: Report) -> None:
-    """Give the robot a new key, and start its program again if it ran; the group's stays.
+    """Give the robot a new key and restart its program if it ran. The group key stays.
 
-    Raises FleetError if it flies, AuthorityError or OSError.
+    Raises FleetError (also if the robot is armed), AuthorityError or OSError.
     """
     authority = open_authority(config)
     async with hold(config, robot, report) as (session, found, _):
@@ -93,11 +96,11 @@ async def renew_key(config: FleetConfig, robot: RobotHost, report: Report) -> No
             await restart(session, config, robot, in_flight=False)
 
 
-async def bring_members(session: Session, config: FleetConfig) -> str | None:
-    """Bring the robot this computer's list of members, and the group's keys, if it has any.
+async def send_members(session: Session, config: FleetConfig) -> str | None:
+    """Send the robot this computer's list of members and group keys, if there are any.
 
-    Its program takes them up by itself, also in flight. What was done, None if nothing was to do.
-    Raises FleetError if the robot's list is newer, ConfigError or OSError.
+    The robot's program reloads them, also in flight. Returns what was done, or None. Raises
+    FleetError if the robot's list is newer, ConfigError or OSError.
     """
     if config.keys is None or not (config.keys / MEMBERS).exists():
         return None
@@ -112,32 +115,32 @@ async def bring_members(session: Session, config: FleetConfig) -> str | None:
     }
     digests = await _digests(session)
     if MEMBERS not in digests:
-        raise RemoteError("it has no key of the fleet: run `lpac fleet enroll`")
+        raise RemoteError("it has no key of this fleet: run `lpac fleet enroll`")
     is_same = digests[MEMBERS] == _sha256(files[MEMBERS])
     known = await _list_number(session)
     if known > number or (known == number and not is_same):
         raise RemoteError(
-            f"its list of members is number {known}, and this computer's {number} is not newer: "
-            "bring `members` from the computer that changed it"
+            f"its list of members, number {known}, is newer than or differs from this computer's, "
+            f"number {number}: copy `members` here from the computer that changed it"
         )
     changed = {name: data for name, data in files.items() if digests.get(name) != _sha256(data)}
     if not changed:
         return None
     await _write(session, changed)
-    return f"it was given the list of members {number}"
+    return f"list of members {number} sent"
 
 
-async def bring_members_to(config: FleetConfig, robot: RobotHost, report: Report) -> None:
-    """Bring one robot the list, whatever it does. Raises as above, and if it does not answer."""
+async def send_members_to(config: FleetConfig, robot: RobotHost, report: Report) -> None:
+    """`send_members` in a session of its own, without the lock."""
     async with visit(config, robot, report) as (session, _):
-        await bring_members(session, config)
+        await send_members(session, config)
 
 
 async def _admit(session: Session, authority: Authority, robot: RobotHost, *, fresh: bool) -> None:
-    """Put the robot's key, a `fresh` one or its own, on the list; its program reads it at a start.
+    """Put the robot's key (a `fresh` one, or its present one) on the list of members.
 
-    On the list is only a key that the robot has: it takes a fresh one, with its certificate, first.
-    A repeat mends what a lost connection left. Raises as `join`.
+    The robot installs a fresh key and its certificate before the key is listed, so that every
+    listed key is in use. A repeat completes what a lost connection interrupted. Raises as `join`.
     """
     await session.call("require_lock")
     await require_disarmed(session, robot, "a new key")
@@ -145,7 +148,7 @@ async def _admit(session: Session, authority: Authority, robot: RobotHost, *, fr
     if fresh:
         files = authority.files(_member(robot, public_key))
         await _write(session, {_NEXT_CERTIFICATE: files[CERTIFICATE_PEM]})
-        await session.must("sh", "-c", f"""cd {_IDENTITY} && mv {_NEXT_KEY} {KEY_PEM} &&
+        await session.check_output("sh", "-c", f"""cd {_IDENTITY} && mv {_NEXT_KEY} {KEY_PEM} &&
 mv {_NEXT_CERTIFICATE} {CERTIFICATE_PEM}""")  # fmt: skip
     issued = authority.issue(
         Role.ROBOT, robot.name, public_key, robot.robot_id, renew_group_key=not fresh
@@ -162,16 +165,16 @@ async def _write(session: Session, files: Mapping[str, bytes]) -> None:
 
 
 async def _public_key(session: Session, *, fresh: bool) -> bytes:
-    """The public key of the robot, whose secret key is made there and never leaves.
+    """Public key of the robot; its secret key is generated there if need be.
 
-    With `fresh` it is another one than before, which counts once `_admit` brings the rest.
+    With `fresh`, a new pair is generated; `_admit` puts it into use.
     """
     key = _NEXT_KEY if fresh else KEY_PEM
-    pem = await session.must("sh", "-c", f"""set -eC; umask 077; mkdir -p {_IDENTITY}
+    pem = await session.check_output("sh", "-c", f"""set -eC; umask 077; mkdir -p {_IDENTITY}
 cd {_IDENTITY}; if [ {int(fresh)} = 1 ] || [ ! -e {key} ]; then
     rm -f part; openssl genpkey -algorithm ed25519 > part; sync part; mv part {key}
 fi
-# For the program's user, who owns the folder around, or will when it starts first.
+# For the program's user, the owner of the parent folder.
 chown -R --no-dereference --reference=.. .; openssl pkey -in {key} -pubout""")  # fmt: skip
     der = base64.b64decode("".join(pem.strip().splitlines()[1:-1]))
     # An Ed25519 key is the last 32 bytes of its DER (RFC 8410).
@@ -179,12 +182,12 @@ chown -R --no-dereference --reference=.. .; openssl pkey -in {key} -pubout""")  
 
 
 async def _digests(session: Session) -> dict[str, str]:
-    """The sha256 of each file of the robot's identity, in hexadecimal. Raises as `must`."""
-    # Not of what its program replaces meanwhile.
+    """Hex sha256 of each file of the robot's identity, by name. Raises as `check_output`."""
+    # Without files that the program may replace meanwhile.
     named = f"-name '*.pem' -o -name {MEMBERS} -o -name {GROUP_KEYS}"
     find = f"find {_IDENTITY} -type f '(' {named} ')' -exec sha256sum {{}} +"
-    said = await session.must("sh", "-c", f"[ ! -d {_IDENTITY} ] || {find}")
-    return {line.rpartition("/")[2]: line[:64] for line in said.splitlines()}
+    output = await session.check_output("sh", "-c", f"[ ! -d {_IDENTITY} ] || {find}")
+    return {line.rpartition("/")[2]: line[:64] for line in output.splitlines()}
 
 
 def _sha256(data: bytes) -> str:
@@ -192,9 +195,9 @@ def _sha256(data: bytes) -> str:
 
 
 async def _list_number(session: Session) -> int:
-    """The number of the robot's list; 0 of one that its program does not take up either."""
+    """Number of the robot's list of members; 0 if the list is damaged."""
     try:
-        text = await session.must("cat", f"{_IDENTITY}/{MEMBERS}")
+        text = await session.check_output("cat", f"{_IDENTITY}/{MEMBERS}")
         return parse_members(text).number
     except ValueError:
         return 0

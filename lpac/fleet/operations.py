@@ -1,4 +1,4 @@
-"""The same for many robots at once: none waits for another, and every one has an outcome."""
+"""Concurrent tasks on several robots, one outcome per robot."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
@@ -11,10 +11,7 @@ T = TypeVar("T")
 
 
 class Outcome(NamedTuple, Generic[T]):
-    """Outcome for one robot: a value, or why there is none.
-
-    `interrupted`: Ctrl-C came before it was done.
-    """
+    """Result for one robot: a value or a `problem`. `interrupted`: by Ctrl-C."""
 
     robot: RobotHost
     value: T | None
@@ -27,7 +24,7 @@ async def for_each(
     task: Callable[[RobotHost], Awaitable[T]],
     on_outcome: Callable[[Outcome[T]], None] = lambda _: None,
 ) -> list[Outcome[T]]:
-    """Do `task` with all robots side by side; the outcomes in the robots' order."""
+    """Run `task` for all robots concurrently; return the outcomes in the robots' order."""
 
     async def one(robot: RobotHost) -> Outcome[T]:
         try:
@@ -39,7 +36,7 @@ async def for_each(
         on_outcome(outcome)
         return outcome
 
-    # Not gather, which on Ctrl-C waits for the first session alone to be ended in order.
+    # On Ctrl-C a task group awaits all sessions; gather awaits only the first.
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(one(robot)) for robot in robots]
     return [task.result() for task in tasks]

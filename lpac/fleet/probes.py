@@ -1,4 +1,4 @@
-"""Probes of the robot's computer: what its own tools print, parsed here; nothing is changed."""
+"""Read-only probes of a robot's computer: the output of its own tools, parsed."""
 
 import json
 import re
@@ -14,7 +14,7 @@ Facts = dict[str, Any]
 
 VISION_HUB = "/etc/modalai/voxl-vision-hub.conf"
 _IDENTITY = "/var/lib/private/lpac/identity"
-# Of wireless interfaces, each after a line with its name.
+# Prints each wireless interface after a line with its name.
 _WIFI = """cat /proc/net/wireless; for i in $({
     ls -d /sys/class/net/*/wireless | cut -d/ -f5
     iw dev | sed -n 's/^\\s*Interface //p'
@@ -22,16 +22,15 @@ _WIFI = """cat /proc/net/wireless; for i in $({
 } | sort -u); do
     echo "interface: $i"; iw dev $i link; iw dev $i get power_save; iw dev $i survey dump
 done"""
-# Users without a password, or with the one that every VOXL comes with: root's, as ModalAI's
-# documentation has it.
+# Prints users without a password, or with the factory password from ModalAI's documentation.
 _PASSWORDS = """while IFS=: read -r user stored rest; do case $stored in
     '') echo $user ;;
     \\$[156]\\$*) salt=${stored#\\$?\\$}; kind=${stored#\\$}
         [ "$(openssl passwd -${kind%%\\$*} -salt ${salt%%\\$*} oelinux123)" != "$stored" ] ||
         echo $user ;;
 esac; done < /etc/shadow"""
-# Whether a program without privileges can keep strangers from the radio's port, as
-# edge.drivers.door does: hardened kernels let root alone attach a filter.
+# Prints "yes" if an unprivileged program can filter the radio's port as edge.drivers.door does.
+# Hardened kernels allow only root to attach a filter.
 _FILTER = """import ctypes, os, socket, struct
 os.setgroups([]); os.setresuid(65534, 65534, 65534)
 passes_all = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0xFFFFFFFF))
@@ -45,27 +44,27 @@ if [ "$all" ]; then docker inspect $all; else echo '[]'; fi"""
 
 
 async def wifi(session: Session) -> list[Facts]:
-    """The wireless interfaces; empty where there is none."""
-    return wifi_of((await session.look({"wifi": _WIFI}))["wifi"])
+    """Wireless interfaces of the robot."""
+    return wifi_of((await session.capture({"wifi": _WIFI}))["wifi"])
 
 
 async def containers(session: Session) -> list[Facts] | None:
-    """The containers of a container engine, empty where there is none; None if it is silent."""
-    return containers_of((await session.look({"containers": _DOCKER}))["containers"])
+    """Docker's containers; [] without docker, None if docker does not answer."""
+    return containers_of((await session.capture({"containers": _DOCKER}))["containers"])
 
 
 async def units(session: Session, names: Sequence[str]) -> dict[str, Facts]:
-    """Whether each unit is there, runs, and starts at boot; none does where systemd is silent."""
-    told = units_of((await session.look({"units": shlex.join(_show(names))}))["units"])
-    nowhere = {"there": False, "active": False, "enabled": False}
-    return {name: told.get(name.removesuffix(".service"), nowhere) for name in names}
+    """Whether each unit exists, is active, and is enabled; all False if systemd is silent."""
+    found = units_of((await session.capture({"units": shlex.join(_show(names))}))["units"])
+    missing = {"there": False, "active": False, "enabled": False}
+    return {name: found.get(name.removesuffix(".service"), missing) for name in names}
 
 
 async def unit(session: Session, name: str) -> Facts:
-    """The same of one unit. Raises RemoteError where systemd is silent."""
-    for told in units_of(await session.must(*_show([name]))).values():
-        return told
-    raise RemoteError(f"systemd says nothing of unit {name}")
+    """As `units`, of one unit. Raises RemoteError if systemd is silent."""
+    for found in units_of(await session.check_output(*_show([name]))).values():
+        return found
+    raise RemoteError(f"systemd reports nothing about unit {name}")
 
 
 def _show(names: Sequence[str]) -> list[str]:
@@ -75,45 +74,42 @@ def _show(names: Sequence[str]) -> list[str]:
 
 
 async def ping(session: Session, addresses: Mapping[str, str], count: int) -> dict[str, Facts]:
-    """ICMP echo to all of them at once: by name share lost, and time there and back, ms.
+    """Ping all addresses at once; by name, the share lost and the round-trip times, ms.
 
     Raises RemoteError if there is no `ping`.
     """
-    await session.must("ping", "-V")
+    await session.check_output("ping", "-V")
     one = f"ping -n -q -c {count} -i 0.2 -W 1 -w {count // 5 + 2}"
     script = [
         f"{{ {one} {shlex.quote(to)} 2>&1 | sed {shlex.quote(f's/^/{name} /')}; }} &"
         for name, to in addresses.items()
     ]
-    said = (await session.look({"": "\n".join([*script, "wait"])}, each_s=20.0))[""]
-    lines = [line.partition(" ") for line in said.splitlines()]
+    output = (await session.capture({"": "\n".join([*script, "wait"])}, each_s=20.0))[""]
+    lines = [line.partition(" ") for line in output.splitlines()]
     return {
         name: ping_summary("\n".join(text for of, _, text in lines if of == name))
         for name in addresses
     }
 
 
-# Parsing
-
-
 def ping_summary(text: str) -> Facts:
-    """Loss (0 to 1) and times, ms, of what `ping -q` prints; all is lost if it says nothing."""
+    """Parse `ping -q`: loss (0 to 1) and times, ms. Without a summary, everything is lost."""
     sent = re.search(r"(\d+) packets transmitted, (\d+) (?:packets )?received", text)
     times = re.search(r"= ([\d.]+)/([\d.]+)/([\d.]+)", text)
     loss = 1.0
     if sent and int(sent[1]):
-        # Answers that came twice count once.
+        # Duplicate answers may make it negative.
         loss = max(0.0, 1.0 - float(sent[2]) / float(sent[1]))
-    heard = times if loss < 1.0 else None
+    answered = times if loss < 1.0 else None
     return {
         "loss": loss,
-        "mean_ms": float(heard[2]) if heard else None,
-        "max_ms": float(heard[3]) if heard else None,
+        "mean_ms": float(answered[2]) if answered else None,
+        "max_ms": float(answered[3]) if answered else None,
     }
 
 
 def open_ports(text: str) -> list[Facts]:
-    """The ports that other computers reach, of `ss -tulnp`: protocol, number and program."""
+    """Parse `ss -tulnp`: protocol, number and program of the ports open to other computers."""
     found: dict[tuple[str, int], str] = {}
     for line in text.splitlines():
         match = re.match(r"(udp|tcp)\s+\S+\s+\d+\s+\d+\s+(\S+):(\d+)\s", line)
@@ -126,13 +122,13 @@ def open_ports(text: str) -> list[Facts]:
 
 
 def systemd_version(text: str) -> int | None:
-    """The version in what `systemctl --version` prints."""
+    """Parse `systemctl --version`."""
     match = re.match(r"systemd (\d+)", text)
     return int(match[1]) if match else None
 
 
 def memory(text: str) -> Facts | None:
-    """Total and available memory, bytes, of /proc/meminfo."""
+    """Parse /proc/meminfo: total and available memory, bytes."""
     values = dict(re.findall(r"^(\w+):\s+(\d+) kB", text, re.MULTILINE))
     if not {"MemTotal", "MemAvailable"} <= set(values):
         return None
@@ -141,13 +137,13 @@ def memory(text: str) -> Facts | None:
 
 
 def synchronized(text: str) -> bool | None:
-    """Whether a time server keeps the clock, of what `timedatectl` prints; None if unknown."""
-    said = group(r"(?:System clock|NTP) synchronized: (yes|no)", text)
-    return None if said is None else said == "yes"
+    """Parse `timedatectl`: whether a time server keeps the clock, None if unknown."""
+    found = group(r"(?:System clock|NTP) synchronized: (yes|no)", text)
+    return None if found is None else found == "yes"
 
 
 def disks_of(text: str) -> list[Facts]:
-    """Free and total bytes of the file systems in what `df -P -B1` prints, each once."""
+    """Parse `df -P -B1`: free and total bytes of each file system."""
     found = re.findall(r"^.*?\s(\d+)\s+\d+\s+(\d+)\s+\d+%\s+(/.*)$", text, re.MULTILINE)
     return [
         {"path": path, "free_bytes": int(free), "total_bytes": int(total)}
@@ -156,35 +152,35 @@ def disks_of(text: str) -> list[Facts]:
 
 
 def hottest_c(text: str) -> float | None:
-    """The hottest of what measures processors; other zones may be no temperatures at all."""
+    """Highest temperature of the CPU, GPU and package zones; other zones may not be in °C."""
     zones = re.findall(r"^.*(?:cpu|gpu|pkg).* (-?\d+)$", text, re.MULTILINE)
     return max((max(int(value) / 1000.0, -273.0) for value in zones), default=None)
 
 
 def wifi_of(text: str) -> list[Facts]:
-    """The wireless interfaces, of the kernel's table and what `iw` prints of each."""
+    """Parse the output of `_WIFI`: /proc/net/wireless, then `iw`'s output for each interface."""
     table, *blocks = re.split(r"^interface: ", text, flags=re.MULTILINE)
     levels = wireless(table)
     found = {}
     for block in blocks:
-        name, _, said = block.partition("\n")
-        link = iw_link(said) | iw_survey(said) | {"name": name}
+        name, _, output = block.partition("\n")
+        link = iw_link(output) | iw_survey(output) | {"name": name}
         if link["signal_dbm"] is None:
             link["signal_dbm"] = levels.get(name)
-        save = group(r"Power save: (on|off)", said)
+        save = group(r"Power save: (on|off)", output)
         link["power_save"] = None if save is None else save == "on"
         found[name] = link
     return [found[name] for name in sorted(found)]
 
 
 def wireless(text: str) -> dict[str, float | None]:
-    """Signal level, dBm, by interface, of /proc/net/wireless; None where it is not in dBm."""
+    """Parse /proc/net/wireless: signal level by interface, dBm; None if it is in another unit."""
     found = re.findall(r"^\s*(\S+):\s+[0-9a-f]+\s+\S+\s+(-?\d+)", text, re.MULTILINE)
     return {name: float(level) if float(level) < 0.0 else None for name, level in found}
 
 
 def iw_link(text: str) -> Facts:
-    """Parse `iw dev NAME link`; `connected` is None if it tells nothing."""
+    """Parse `iw dev NAME link`; `connected` is None if unknown."""
     joined = group(r"^(Connected to|Joined IBSS|Not connected)", text)
     return {
         "connected": None if joined is None else joined != "Not connected",
@@ -196,9 +192,9 @@ def iw_link(text: str) -> Facts:
 
 
 def iw_survey(text: str) -> Facts:
-    """How long its radio has listened to the channel in use, and found it busy, ms.
+    """Parse `iw dev NAME survey dump`: active and busy time of the channel in use, ms.
 
-    Of `iw dev NAME survey dump`; None where the driver does not count.
+    None if the driver does not count them.
     """
     blocks = re.split(r"^Survey data from .*$", text, flags=re.MULTILINE)
     used = next((block for block in blocks if re.search(r"frequency:.*\[in use\]", block)), "")
@@ -209,27 +205,27 @@ def iw_survey(text: str) -> Facts:
 
 
 def vision_hub(text: str) -> Facts | None:
-    """voxl-vision-hub's configuration as far as it matters; None where there is none."""
+    """Parse voxl-vision-hub's configuration: the keys that matter here; None without a file."""
     if not text:
         return None
     try:
         values = json.loads(without_comments(text))
     except ValueError as error:
-        return {"problem": f"it is no JSON: {error}"}
+        return {"problem": f"not JSON: {error}"}
     if not isinstance(values, dict):
-        return {"problem": "it is no JSON object"}
+        return {"problem": "not a JSON object"}
     keys = ("en_localhost_mavlink_udp", "localhost_udp_port_number", "offboard_mode")
     return {key: values.get(key) for key in keys}
 
 
 def without_comments(text: str) -> str:
-    """JSON without the comments that ModalAI's files may have: as in C, outside of strings."""
+    """Strip C comments, which ModalAI's JSON files may have, outside of strings."""
     pattern = r'("(?:\\.|[^"\\])*")|/\*.*?\*/|//[^\n]*'
     return re.sub(pattern, lambda match: match[1] or " ", text, flags=re.DOTALL)
 
 
 def units_of(text: str) -> dict[str, Facts]:
-    """Parse `systemctl show` of units, by name without ".service"."""
+    """Parse `systemctl show`, by unit name without ".service"."""
     found = {}
     for block in re.split(r"\n\s*\n", text.strip()):
         values = dict(line.split("=", 1) for line in block.split("\n") if "=" in line)
@@ -243,13 +239,13 @@ def units_of(text: str) -> dict[str, Facts]:
 
 
 def containers_of(text: str) -> list[Facts] | None:
-    """Parse `docker inspect` of containers, as far as it matters here; None if it is none."""
+    """Parse `docker inspect`; None if it is not its output."""
     try:
-        told = msgspec.json.decode(text, type=list[dict[str, Any]])
+        containers = msgspec.json.decode(text, type=list[dict[str, Any]])
     except msgspec.MsgspecError:
         return None
     found = []
-    for one in told:
+    for one in containers:
         host = one.get("HostConfig") or {}
         mounts = [str(bind).split(":")[0] for bind in host.get("Binds") or []]
         has_device = any(mount == "/dev" or mount.startswith("/dev/") for mount in mounts)
@@ -265,13 +261,13 @@ def containers_of(text: str) -> list[Facts] | None:
 
 
 def group(pattern: str, text: str) -> str | None:
-    """The first group of the first match."""
+    """First group of the first match, or None."""
     match = re.search(pattern, text, re.MULTILINE)
     return match[1] if match else None
 
 
 def number(text: str | None) -> float | None:
-    """A decimal number, None if it is none."""
+    """Parse a decimal number; None if it is not one."""
     try:
         return None if text is None else float(text)
     except ValueError:
@@ -283,15 +279,16 @@ def _or_none(text: str) -> str | None:
 
 
 async def facts(session: Session, directory: str, names: Sequence[str]) -> Facts:
-    """All that can be looked at; of the units, those with `names`."""
+    """Run all probes; `names` are the units to include."""
     there = f"d={directory}; while [ ! -d ${{d:=/}} ]; do d=${{d%/*}}; done"
     disks = f"{there}; df -P -B1 $d /var/lib"
-    said = await session.look({"disks": disks} | {name: its[0] for name, its in _FACTS.items()})
-    found: Facts = {name: its[1](said[name]) for name, its in _FACTS.items()}
-    return found | {"disks": disks_of(said["disks"]), "units": await units(session, names)}
+    commands = {"disks": disks} | {name: command for name, (command, _) in _FACTS.items()}
+    output = await session.capture(commands)
+    found: Facts = {name: parse(output[name]) for name, (_, parse) in _FACTS.items()}
+    return found | {"disks": disks_of(output["disks"]), "units": await units(session, names)}
 
 
-# What is printed, and how it is parsed.
+# Fact -> command, and parser of its output.
 _FACTS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "kernel": ("uname -r", str),
     "python": ("python3 -V", lambda text: group(r"([\d.]+)", text) or "0"),

@@ -1,4 +1,4 @@
-"""The robot's program under systemd, started and stopped; a vehicle without one, landed."""
+"""Start and stop the robot's unit; land a vehicle whose program is gone."""
 
 import time
 from base64 import b64encode
@@ -10,17 +10,17 @@ from lpac.fleet.hold import Report
 from lpac.fleet.session import RemoteError, Session
 from lpac.fleet.settings import FleetConfig, RobotHost
 
-# Where PX4's sticks fly the vehicle.
+# PX4 modes that a pilot flies by the sticks.
 _PILOTED = ("manual", "stabilized", "altitude", "position")
-# PX4 tells its mode once a second.
+# PX4 reports its mode at 1 Hz.
 _LANDS_S = 8.0
-_COMPONENT = 198  # beside the robot's program and its watchdog
+_COMPONENT = 198  # MAVLink component id, distinct from the program's and its watchdog's
 
 
 async def start(session: Session, config: FleetConfig) -> None:
-    """Start the unit now and at every boot, and wait until the program is well.
+    """Start the unit, now and at every boot, and wait until the program is healthy.
 
-    Raises RemoteError if it is not, or if a file of the release is not what it was when it came.
+    Raises RemoteError if it does not become healthy or the release is damaged.
     """
     await require_whole(session, config)
     await _start(session)
@@ -29,15 +29,15 @@ async def start(session: Session, config: FleetConfig) -> None:
 async def restart(
     session: Session, config: FleetConfig, robot: RobotHost, *, in_flight: bool
 ) -> None:
-    """Stop the unit and start it again; as `stop` and `start`."""
-    # First what takes time: a vehicle may wait in the air.
+    """`stop`, then `start`."""
+    # The slow check comes first: a vehicle may be in the air between stop and start.
     await require_whole(session, config)
     await stop(session, robot, in_flight=in_flight, disable=False)
     await _start(session)
 
 
 async def require_whole(session: Session, config: FleetConfig) -> None:
-    """Raises RemoteError if a file of the current release is not what it was when it came."""
+    """Raises RemoteError if the current release is missing, damaged, or a spare's."""
     current = f"{config.directory}/current/"
     if (await session.run("test", "-e", f"{current}robot.toml")).code != 0:
         raise RemoteError("there is no release for a slot on this robot: deploy first")
@@ -46,68 +46,67 @@ async def require_whole(session: Session, config: FleetConfig) -> None:
 
 async def _start(session: Session) -> None:
     await session.run("systemctl", "reset-failed", UNIT)
-    await session.must("systemctl", "enable", UNIT)
-    # A program that cannot start shows in its health, with the reason.
+    await session.check_output("systemctl", "enable", UNIT)
+    # `health` reports a program that cannot start, with the reason.
     await session.run("systemctl", "start", UNIT, timeout_s=90.0)
     await session.call("health")
 
 
 async def stop(session: Session, robot: RobotHost, *, in_flight: bool, disable: bool) -> None:
-    """Stop the unit; a vehicle in flight holds or lands then, as its `on_stop` says.
+    """Stop the unit; with `disable`, also at boot. A vehicle in flight follows `on_stop`.
 
-    Refused while the vehicle is armed unless `in_flight` insists. With `disable` it does not start
-    at the next boot either.
+    Refused while the vehicle is armed, unless `in_flight`.
     """
     if not in_flight:
         await require_disarmed(session, robot, "stopping")
     if (await session.call("service"))["installed"]:
-        await session.must("systemctl", "stop", UNIT)
+        await session.check_output("systemctl", "stop", UNIT)
         if disable:
-            await session.must("systemctl", "disable", UNIT)
+            await session.check_output("systemctl", "disable", UNIT)
 
 
 async def require_disarmed(session: Session, robot: RobotHost, doing: str) -> None:
-    """Raises RemoteError if the vehicle is armed, as far as anybody on the robot can tell."""
+    """Raises RemoteError if the vehicle is known to be armed."""
     await session.call("require_disarmed", mavlink_port=robot.mavlink_port, doing=doing)
 
 
-async def hear_heartbeat(session: Session, robot: RobotHost) -> dict[str, Any] | None:
-    """PX4's heartbeat within 2.5 s, and its `sender`; None if none comes."""
-    heard = await session.call("hear_heartbeat", port=robot.mavlink_port)
-    beat: dict[str, Any] | None = heard["heartbeat"]
+async def receive_heartbeat(session: Session, robot: RobotHost) -> dict[str, Any] | None:
+    """Wait up to 2.5 s for PX4's heartbeat; return it with its `sender`, or None."""
+    received = await session.call("receive_heartbeat", port=robot.mavlink_port)
+    beat: dict[str, Any] | None = received["heartbeat"]
     return beat
 
 
 async def land(session: Session, robot: RobotHost, report: Report) -> dict[str, Any]:
-    """Let PX4 land where it is; the last heartbeat that was heard of it.
+    """Command PX4 to land where it is; return its last heartbeat.
 
-    Refused while the program runs, and while a pilot flies: neither is to be fought with.
+    Raises RemoteError if the robot's program runs, a pilot flies, or PX4 does not land.
     """
     if (await session.call("service"))["fresh"]:
         raise RemoteError(
-            "its program runs: `lpac mission land` lands it, in pilot after `lpac mission rejoin`"
+            "its program runs: use `lpac mission land`, in pilot after `lpac mission rejoin`"
         )
-    report("listens to PX4", None)
-    beat = await hear_heartbeat(session, robot)
+    report("await PX4", None)
+    beat = await receive_heartbeat(session, robot)
     if beat is None:
-        raise RemoteError(f"nothing is heard of PX4 at UDP port {robot.mavlink_port}")
+        raise RemoteError(f"no heartbeat of PX4 at UDP port {robot.mavlink_port}")
     if beat["system_id"] != robot.system_id:
         raise RemoteError(
-            f"PX4 is system {beat['system_id']}, not {robot.system_id}: mend the fleet file"
+            f"PX4 is system {beat['system_id']}, not {robot.system_id}: correct fleet.toml"
         )
     if not beat["armed"]:
-        raise RemoteError("it is disarmed: nothing is to land")
+        raise RemoteError("it is disarmed: there is nothing to land")
     if beat["mode"] in _PILOTED:
-        raise RemoteError(f"a pilot flies it ({beat['mode']}): he lands it")
-    report("lands it", None)
+        raise RemoteError(f"a pilot flies it ({beat['mode']}): the pilot must land it")
+    report("land", None)
     until_s, sequence = time.monotonic() + _LANDS_S, 0
     while beat["armed"] and beat["mode"] != "land":
         if time.monotonic() > until_s:
-            raise RemoteError(f"it does not land, and is in {beat['mode']}: a pilot must take it")
+            raise RemoteError(f"it does not land and is in {beat['mode']}: a pilot must take over")
         sequence += 1
         command = land_command(sequence, robot.system_id, _COMPONENT)
         await session.call(
             "send", port=robot.mavlink_port, to=beat["sender"], content=b64encode(command).decode()
         )
-        beat = await hear_heartbeat(session, robot) or beat
+        beat = await receive_heartbeat(session, robot) or beat
     return beat

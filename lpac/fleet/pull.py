@@ -1,4 +1,4 @@
-"""Fetching what robots recorded of a trial: resumable, and checked against their checksums."""
+"""Fetch logs from the robots; resumable, and checked against the robots' checksums."""
 
 import asyncio
 import contextlib
@@ -22,18 +22,17 @@ SUMS = "SHA256SUMS"
 
 _STATE = "/var/lib/private/lpac"
 _PLACE = "/var/tmp/lpac-pull-"
-# The journal holds what was before and after a trial, too.
+# The journal also covers the time just before and after a trial.
 _MARGIN_S = 30.0
-# Of a robot's longest call.
+# Below the session's own timeout for a call.
 _STAGE_S = 380.0
-# Modification time and path, of the flight logs and of PX4's; a laptop that has gone an hour ago
-# fetches nothing any more.
+# Prints modification time and path of flight logs and PX4 logs. Folders that an interrupted pull
+# left are removed after an hour.
 _LIST = f"""find {_PLACE}* -maxdepth 0 -mmin +60 -exec rm -rf {{}} +
 find {_STATE}/logs -type f -name '*.mcap' -printf '%T@ %p\\n'
 find /data/px4/log -type f -path '*/sess*/*.ulg' -printf '%T@ %p\\n'"""
-# Large files are only linked to, so that nothing of them is copied on the robot; but those that may
-# still grow are, so that what travels is what the checksums are of. A link that somebody put there
-# may lead anywhere.
+# Files are linked, not copied on the robot; but a file that may still grow is copied, so that its
+# checksum matches what is sent. Existing symlinks are skipped: they may point anywhere.
 _STAGE = f"""set -e; umask 077; d=$(mktemp -d {_PLACE}XXXXXX); trap 'rm -rf "$d"' EXIT
 put() {{
     [ -f "$2" ] && [ ! -L "$2" ] || return 0
@@ -47,7 +46,7 @@ Interval = tuple[float, float]
 
 
 class Pulled(NamedTuple):
-    """Files that were fetched to `folder`, how much of them travelled, and a word about it."""
+    """Files fetched to `folder`, and a summary; `sent_bytes` is what was transferred of them."""
 
     folder: str
     files: int
@@ -61,22 +60,22 @@ async def pull(
 ) -> Pulled:
     """Fetch flight logs, PX4's logs and parameters, journal, configuration and versions.
 
-    To `out`/TRIAL/ROBOT; without a trial, whatever is newer than what is there, to `out`/all/ROBOT.
-    `SHA256SUMS` there is what the robot said, and `sha256sum -c` understands it. Files of earlier
-    pulls are never lost: robots number their logs from 1 again once those are removed. Raises
-    FleetError, also if the robot has nothing of the trial.
+    They go to `out`/TRIAL/ROBOT; without a trial, everything new goes to `out`/all/ROBOT. The
+    robot's checksums are in `SHA256SUMS`, for `sha256sum -c`. Files of earlier pulls are never
+    overwritten by others of the same name: a robot whose logs were removed numbers them from 1
+    again. Raises FleetError, also if the robot has nothing of the trial.
     """
     folder = out.resolve() / ("all" if trial is None else trial.replace("/", "_")) / robot.name
     async with visit(config, robot, report) as (session, found):
         await require_disarmed(session, robot, "pulling")
         listed = await session.run("sh", "-c", _LIST)
-        found_at = [line.split(" ", 1) for line in listed.out.splitlines()]
-        times = {path: float(time_s) for time_s, path in found_at}
+        entries = [line.split(" ", 1) for line in listed.out.splitlines()]
+        times = {path: float(time_s) for time_s, path in entries}
         if trial is None:
             interval, logs = (_newest_s(folder), math.inf), [path for path in times if _log(path)]
             logs = [path for path in logs if times[path] >= interval[0]]
         else:
-            report("reads the flight logs", None)
+            report("read flight logs", None)
             logs, flown = await _of_trial(session, config, trial, times)
             if trial not in flown:
                 return _nothing(config, robot, trial, folder, times, list(flown))
@@ -96,16 +95,16 @@ async def pull(
                 on_share=lambda share: report("fetch", share),
             )  # fmt: skip
         finally:
-            # A robot out of reach removes it later by itself; the transfer's problem is to be told.
+            # The next pull removes it from a robot that is out of reach now.
             with contextlib.suppress(UnreachableError):
                 await session.run("rm", "-rf", remote)
     report("check", None)
     await asyncio.to_thread(_check, folder, sums)
     _write_sums(folder, _read_sums(folder) | sums)
     size_bytes = sum((folder / name).stat().st_size for name in sums)
-    summary = "whole" if sent_bytes else "was here already"
+    summary = "complete" if sent_bytes else "was here already"
     if kept is not None:
-        summary += f"; files of the same names that were here are in {kept}"
+        summary += f"; older files of the same names are in {kept}"
     return Pulled(str(folder), len(sums), size_bytes, sent_bytes, summary)
 
 
@@ -116,9 +115,9 @@ def _log(path: str) -> bool:
 async def _of_trial(
     session: Session, config: FleetConfig, trial: str, times: dict[str, float]
 ) -> tuple[list[str], dict[str, Interval]]:
-    """The trial's flight logs, and when each trial was flown, the newest last.
+    """The trial's flight logs, and the interval of each trial, the newest last.
 
-    The release reads its own logs. Raises RemoteError.
+    The logs are read on the robot by its own release. Raises RemoteError.
     """
     paths = [path for path in times if _log(path)]
     if not paths:
@@ -139,7 +138,7 @@ async def _of_trial(
 
 
 def _ulogs(times: dict[str, float], interval: Interval) -> list[str]:
-    """PX4's logs that may overlap the interval: each was begun after the one before it ended."""
+    """PX4 logs that may overlap the interval; each begins after the one before it ends."""
     found, began_s = [], 0.0
     for path in sorted((p for p in times if not _log(p)), key=lambda p: (times[p], p)):
         if times[path] >= interval[0] and began_s <= interval[1]:
@@ -156,7 +155,7 @@ async def _stage(
     logs: list[str],
     ulogs: list[str],
 ) -> tuple[str, dict[str, str]]:
-    """The robot's folder to fetch, following its links, and the sha256 of each file in it."""
+    """Link the files in one folder on the robot; return it, and the sha256 of each file."""
     files = {f"logs/{path.rpartition('/')[2]}": path for path in logs}
     files |= {"/".join(["px4", *path.split("/")[-2:]]): path for path in ulogs}
     files["px4/parameters"] = "/data/px4/param/parameters"
@@ -173,7 +172,7 @@ async def _stage(
         f'{shlex.join(journal)} > "$d/{name}"',
         'cd "$d"; pwd; find -L . -type f -exec sha256sum {} +; trap - EXIT',
     ]
-    shown = await session.must("sh", "-c", "\n".join(script), timeout_s=_STAGE_S)
+    shown = await session.check_output("sh", "-c", "\n".join(script), timeout_s=_STAGE_S)
     remote, *sums = shown.splitlines()
     return remote, {
         path.removeprefix("./"): digest for digest, path in (s.split("  ") for s in sums)
@@ -183,9 +182,9 @@ async def _stage(
 async def _keep_others(
     session: Session, remote: str, folder: Path, sums: dict[str, str]
 ) -> str | None:
-    """Move what the transfer would overwrite, but for files that it continues or mends.
+    """Move away files that the transfer would overwrite, unless it continues or repairs them.
 
-    Returns the folder in `folder` that has them now, None if there are none.
+    Returns the subfolder that has them now, or None.
     """
     known = _read_sums(folder)
     here = {
@@ -199,7 +198,7 @@ async def _keep_others(
         name: f"head -c {path.stat().st_size} {shlex.quote(f'{remote}/{name}')} | sha256sum"
         for name, path in here.items()
     }
-    beginnings = await session.look(commands, each_s=_STAGE_S / len(commands))
+    beginnings = await session.capture(commands, each_s=_STAGE_S / len(commands))
     others = [
         name
         for name, path in here.items()
@@ -228,27 +227,24 @@ def _nothing(
     times: dict[str, float],
     trials: list[str],
 ) -> Pulled:
-    """Raises RemoteError unless that is as it should be."""
+    """Result for a spare that never flew. Raises RemoteError for any other robot."""
     if not any(map(_log, times)) and config.slot_of(robot.name) is None:
         return Pulled(str(folder), 0, 0, 0, "a spare that never flew")
-    flown = f"it has {', '.join(map(repr, trials[-5:]))}" if trials else "it has none at all"
-    raise RemoteError(f"it has nothing of trial {trial!r}; {flown}")
+    flown = f"it has {', '.join(map(repr, trials[-5:]))}" if trials else "it has none of any trial"
+    raise RemoteError(f"it has no logs of trial {trial!r}; {flown}")
 
 
 def _newest_s(folder: Path) -> float:
-    """When the newest of the logs that came whole was written to, Unix time; 0 without any.
-
-    Those of a pull that broke off do not count.
-    """
+    """Modification time of the newest log that was fetched completely, Unix time; 0 if none."""
     logs = [folder / name for name in _read_sums(folder) if name.endswith((".mcap", ".ulg"))]
     return max((log.stat().st_mtime for log in logs if log.exists()), default=0.0)
 
 
 def _check(folder: Path, sums: dict[str, str]) -> None:
-    """Raises RemoteError if a file here is not what the robot has."""
+    """Raises RemoteError if a fetched file differs from the robot's."""
     for name, wanted in sums.items():
         if _sha256(folder / name) != wanted:
-            raise RemoteError(f"{name} did not come whole: pull again")
+            raise RemoteError(f"{name} was damaged in transfer: pull again")
 
 
 def _sha256(path: Path) -> str:
@@ -257,7 +253,7 @@ def _sha256(path: Path) -> str:
 
 
 def _read_sums(folder: Path) -> dict[str, str]:
-    """File -> sha256 of what came in earlier pulls."""
+    """sha256 by file name, from earlier pulls."""
     path = folder / SUMS
     if not path.exists():
         return {}

@@ -1,7 +1,7 @@
-"""Release: image, policy, world, configuration, unit and lock of versions, sent as one.
+"""Release: image, policy, world, configuration, units and versions, sent as one.
 
-A release is named by its content: the first 16 hexadecimal digits of the sha256 of its manifest,
-which has the hash of every file. On a robot it lies in a folder that its number names.
+Its id is the first 16 hex digits of the sha256 of its manifest, which has the hash of every file.
+On the robot it is a folder named by its number.
 """
 
 import hashlib
@@ -27,14 +27,15 @@ Entry = tuple[str, str]
 
 
 class ReleaseError(ValueError):
-    """A release cannot be made; one line says why, and what to do."""
+    """Invalid part of a release. The message is one line: the cause, then what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """The unpacked image in `folder`: `entries` maps paths to (mode, sha256) or ("link", target).
+    """Unpacked image in `folder`.
 
-    `id` names its content, `machine` is what `uname -m` says on robots that it runs on.
+    `entries` maps paths to (mode, sha256) or ("link", target). `id` is the hash of its content,
+    `machine` the `uname -m` of the robots that it runs on.
     """
 
     folder: Path
@@ -46,9 +47,9 @@ class Image:
 
 
 class Release(NamedTuple):
-    """One robot's release: the image beside it, all else in `folder`, ready to travel.
+    """One robot's release: `image`, and everything else in `folder`.
 
-    `number` is greater than that of any release before.
+    `number` is greater than that of any earlier release.
     """
 
     id: str
@@ -59,7 +60,7 @@ class Release(NamedTuple):
 
 
 class Common(NamedTuple):
-    """Parts that the releases of a fleet share, checked, and their number: the time, Unix s."""
+    """Checked parts that a fleet's releases share, and their number: the Unix time, s."""
 
     number: int
     image: Image
@@ -80,13 +81,13 @@ def load_common(config: FleetConfig) -> Common:
 
 
 def load_image(folder: Path) -> Image:
-    """The unpacked image that `make image` has made. Raises ReleaseError."""
+    """Load the unpacked image from `make image`. Raises ReleaseError."""
     root = folder / "root"
     try:
         packages = json.loads((root / _IMAGE_VERSIONS).read_text("utf-8"))
         machine = {"arm64": "aarch64", "amd64": "x86_64"}[packages["architecture"]]
     except (OSError, ValueError, KeyError):
-        raise ReleaseError(f"{folder}: no image is there: run `make image`") from None
+        raise ReleaseError(f"{folder}: has no image: run `make image`") from None
     entries: dict[str, Entry] = {}
     size_bytes = 0
     for parent, folders, files in os.walk(root):
@@ -104,7 +105,7 @@ def load_image(folder: Path) -> Image:
 
 
 def make_release(config: FleetConfig, robot: RobotHost, common: Common, folder: Path) -> Release:
-    """Put together in `folder`, which must be empty, what this robot gets besides the image."""
+    """Write everything but the image to `folder`, which must be empty."""
     slot = config.slot_of(robot.name)
     files = {f"bundle/{name}": data for name, data in common.bundle.files.items()}
     files["world.env"] = common.world
@@ -138,14 +139,14 @@ def make_release(config: FleetConfig, robot: RobotHost, common: Common, folder: 
 
 
 def drop_ins(config: FleetConfig, robot: RobotHost) -> dict[str, str]:
-    """Overrides of the units: the texts of lpac-robot.conf and lpac-land.conf, if any."""
+    """Drop-ins of the units: the texts of lpac-robot.conf and lpac-land.conf, if any."""
     unit, place = [], []
     if config.directory != DEFAULT_DIRECTORY:
         current = f"{config.directory}/current"
         unit = ["ConditionPathExists=", f"ConditionPathExists={current}/robot.toml"]
         place = [
             f"RootDirectory={config.directory}/sandbox",
-            # It empties BindPaths too.
+            # The empty assignment also clears BindPaths.
             "BindReadOnlyPaths=",
             f"BindReadOnlyPaths={current}/root:/",
             f"BindReadOnlyPaths={current}:/release",
@@ -168,7 +169,7 @@ def drop_ins(config: FleetConfig, robot: RobotHost) -> dict[str, str]:
 
 
 def _entry(path: Path, info: os.stat_result) -> Entry:
-    """As `lpac.fleet.agent.check` reads it there."""
+    """Manifest entry, as `lpac.fleet.agent.check` computes it on the robot."""
     if stat.S_ISLNK(info.st_mode):
         return "link", str(path.readlink())
     with path.open("rb") as file:

@@ -1,7 +1,7 @@
-"""A conversation with one robot over OpenSSH, and what it says when there can be none.
+"""SSH session with one robot, and plain explanations of ssh's and rsync's errors.
 
-OpenSSH's own configuration, agent, keys and known_hosts decide; nothing here switches the check of
-host keys off, and nothing asks: a fleet answers at once or not at all.
+OpenSSH's own configuration, agent, keys and known_hosts apply. Host keys are always checked, and
+nothing prompts.
 """
 
 import asyncio
@@ -18,14 +18,14 @@ from edge.drivers.px4 import raw_mavlink
 from lpac.fleet import agent
 from lpac.fleet.settings import FleetConfig, RobotHost
 
-Say = Callable[[str], None]
+OnProgress = Callable[[str], None]
 
-_PING_S = 3.0
-# Of one call: the longest is the policy's verification on a slow CPU.
+_KEEP_ALIVE_S = 3.0
+# The longest call is the policy's verification on a slow CPU.
 _CALL_S = 400.0
-# Between the parts of what `look` has printed.
-_BETWEEN = "\x1e"
-# Reads the modules' sources, makes them modules, and serves. The login shell sees but this.
+# Separates the outputs of `capture`.
+_SEPARATOR = "\x1e"
+# Loads the agent's modules from stdin and serves. The only command that the login shell sees.
 _BOOTSTRAP = """
 import json, os, sys, types
 data = b""
@@ -38,23 +38,23 @@ for name, source in json.loads(data.decode()):
     exec(compile(source, name, "exec"), module.__dict__)
 sys.modules["lpac.fleet.agent"].serve()
 """
-# What ssh and rsync say of a robot, and what that means for a person.
+# Patterns in the output of ssh and rsync, and their explanations.
 _ADVICE = (
     (r"REMOTE HOST IDENTIFICATION HAS CHANGED",
-     "its host key is not the known one: another computer answers, or it was set up anew; "
+     "its host key has changed: another computer answers, or it was reinstalled; "
      "only in that case run `ssh-keygen -R HOST`, and log in once with ssh"),
-    # Where it may not ask, ssh says but this of a key that it has never seen.
+    # In batch mode ssh prints only this for an unknown host key.
     (r"No .* host key is known|Host key verification failed",
      "its host key is not known here: log in once with ssh to accept it"),
-    (r"Permission denied", "it refuses the login: run `lpac fleet enroll`, or look at your key"),
+    (r"Permission denied", "it refuses the login: run `lpac fleet enroll`, or check your key"),
     (r"Could not resolve", "its host name is not known"),
     (r"Connection refused", "nothing listens on its ssh port"),
-    # rsync then says that the connection is closed, too.
+    # Before the next: rsync also reports a closed connection then.
     (r"No space left", "its disk is full"),
     (r"No route to host|timed out|Network is unreachable|not responding|Connection closed|"
      r"Connection reset|Broken pipe|connection unexpectedly closed|timeout in data send/receive",
      "it does not answer: it is off, or out of reach"),
-    # env quotes the name.
+    # The closing quote is env's.
     (r"python3\W?: ((command )?not found|No such)", "python3 is missing on the robot"),
     (r"rsync: (command )?not found", "rsync is missing on the robot"),
     (r"a password is required|sudo: ", "its user may not use sudo without a password"),
@@ -62,19 +62,19 @@ _ADVICE = (
 
 
 class FleetError(OSError):
-    """Something with one robot cannot be done; one line says why, and what to do."""
+    """Failure on one robot. The message is one line: the cause, then what to do."""
 
 
 class UnreachableError(FleetError):
-    """There is no conversation with the robot, or it has broken off."""
+    """The robot cannot be reached, or the session has broken off."""
 
 
 class RemoteError(FleetError):
-    """The robot refuses, or cannot do, what was asked."""
+    """The robot refused or failed the request."""
 
 
 def ssh_command(config: FleetConfig, robot: RobotHost) -> list[str]:
-    """OpenSSH's command line as far as the robot's host."""
+    """OpenSSH's command line up to the robot's host."""
     command = ["ssh", "-o", "BatchMode=yes", "-o", "LogLevel=ERROR", "-T",
                "-o", f"ConnectTimeout={config.ssh.connect_timeout_s:.0f}",
                "-o", "ServerAliveInterval=3", "-o", "ServerAliveCountMax=3"]  # fmt: skip
@@ -86,23 +86,23 @@ def ssh_command(config: FleetConfig, robot: RobotHost) -> list[str]:
 
 
 def as_root(command: str) -> str:
-    """Command line for the login shell that runs `command` as root, who owns releases and units."""
+    """Command line for the login shell that runs `command` as root."""
     text = f'if [ "$(id -u)" = 0 ]; then exec {command}; else exec sudo -n {command}; fi'
     return f"exec sh -c {shlex.quote(text)}"
 
 
 def explain(text: str, host: str) -> str:
-    """Explain ssh's or rsync's last words in one line."""
+    """Explain the error output of ssh or rsync in one line."""
     for pattern, advice in _ADVICE:
         if re.search(pattern, text):
             return advice.replace("HOST", host)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    # Of a connection that has gone silent ssh does not say more.
-    return lines[-1] if lines else "it does not answer any more: it is off, or out of reach"
+    # ssh prints nothing when a connection falls silent.
+    return lines[-1] if lines else "it no longer answers: it is off, or out of reach"
 
 
 class Done(NamedTuple):
-    """A program's exit code, and what it wrote."""
+    """Exit code, stdout and stderr of a program."""
 
     code: int
     out: str
@@ -110,7 +110,7 @@ class Done(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """The last line with which it complained, else its exit code."""
+        """Last line of stderr, else the exit code."""
         lines = [line.strip() for line in self.err.splitlines() if line.strip()]
         return lines[-1] if lines else f"exit code {self.code}"
 
@@ -118,18 +118,22 @@ class Done(NamedTuple):
 class Session:
     """Calls to the functions of `lpac.fleet.agent` on one robot. For one task at a time."""
 
-    def __init__(self, robot: RobotHost, process: asyncio.subprocess.Process, say: Say) -> None:
+    def __init__(
+        self, robot: RobotHost, process: asyncio.subprocess.Process, on_progress: OnProgress
+    ) -> None:
         assert process.stdin is not None and process.stdout is not None
         self.robot = robot
         self._process = process
         self._write, self._read = process.stdin, process.stdout
-        self._say = say
-        # Kept while the session lives: what ssh complains about.
-        self._complaints = asyncio.create_task(self._last_words())
-        self._pings = asyncio.create_task(self._ping())
+        self._on_progress = on_progress
+        self._stderr = asyncio.create_task(self._read_stderr())
+        self._keep_alive = asyncio.create_task(self._send_keep_alive())
 
     async def call(self, function: str, **arguments: object) -> dict[str, Any]:
-        """Its result. Raises RemoteError or UnreachableError."""
+        """Call a function of the agent and return its result.
+
+        Raises RemoteError or UnreachableError.
+        """
         request = {"call": function, "arguments": arguments}
         try:
             self._write.write(json.dumps(request).encode() + b"\n")
@@ -138,7 +142,7 @@ class Session:
                 while line := await self._read.readline():
                     match json.loads(line):
                         case {"progress": str(text)}:
-                            self._say(text)
+                            self._on_progress(text)
                         case {"error": str(text)}:
                             raise RemoteError(text)
                         case {"result": dict(result)}:
@@ -146,32 +150,32 @@ class Session:
                         case _:
                             raise ValueError
         except TimeoutError:
-            raise UnreachableError(f"it has not answered within {_CALL_S:g} s") from None
+            raise UnreachableError(f"it did not answer within {_CALL_S:g} s") from None
         except ConnectionError:
-            pass  # The complaints tell why.
+            pass  # ssh's stderr has the cause.
         except ValueError:
             raise RemoteError(
-                f"its login shell prints {line[:60]!r}: let ~/.bashrc be silent for ssh"
+                f"its login shell prints {line[:60]!r}: make ~/.bashrc print nothing for ssh"
             ) from None
-        raise UnreachableError(explain(await self._all_complaints(), self.robot.host))
+        raise UnreachableError(explain(await self._all_stderr(), self.robot.host))
 
     async def run(self, *command: str, timeout_s: float = 60.0) -> Done:
-        """Run a program as root, whatever its exit code. Raises as `call`."""
+        """Run a program as root; any exit code is accepted. Raises as `call`."""
         return Done(**await self.call("run", command=command, timeout_s=timeout_s))
 
-    async def must(self, *command: str, timeout_s: float = 60.0) -> str:
-        """Output of a program. Raises RemoteError unless it returns 0; else as `call`."""
+    async def check_output(self, *command: str, timeout_s: float = 60.0) -> str:
+        """Output of a program run as root. Raises RemoteError if its exit code is not 0."""
         done = await self.run(*command, timeout_s=timeout_s)
         if done.code != 0:
-            # A script is nothing to read in one line.
+            # A script is too long for a message.
             what = "" if command[0] == "sh" else f"{shlex.join(command)}: "
             raise RemoteError(what + done.reason)
         return done.out
 
-    async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
-        """Output of shell commands, by name, without complaints; in one call.
+    async def capture(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
+        """Run shell commands in one call; return the stdout of each, by name.
 
-        One that does not end in `each_s` has printed what it had by then.
+        A command that runs longer than `each_s` is stopped; its output up to then is kept.
         """
         lines = [
             f"timeout {each_s:g} sh -c {shlex.quote(command)} 2>/dev/null; printf '\\036'"
@@ -179,67 +183,66 @@ class Session:
         ]
         script = "\n".join(["export LC_ALL=C", *lines])
         shown = await self.run("sh", "-c", script, timeout_s=each_s * len(lines) + 5.0)
-        return dict(zip(commands, map(str.strip, shown.out.split(_BETWEEN)), strict=False))
+        return dict(zip(commands, map(str.strip, shown.out.split(_SEPARATOR)), strict=False))
 
     async def write(self, files: Mapping[str, bytes], mode: int = 0o644) -> None:
-        """Write files, each whole or not at all; by path. Raises as `call`."""
+        """Write files, by path, each atomically. Raises as `call`."""
         contents = {path: b64encode(data).decode() for path, data in files.items()}
         await self.call("write", files=contents, mode=mode)
 
     async def close(self) -> None:
-        """End the conversation; locks that it held are free then."""
-        self._pings.cancel()
+        """End the session, which releases its lock."""
+        self._keep_alive.cancel()
         self._write.close()
         try:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(2.0):
                     await self._process.wait()
-        finally:  # also if Ctrl-C comes again
+        finally:  # Also on a second Ctrl-C.
             if self._process.returncode is None:
                 self._process.kill()
                 await self._process.wait()
-            # Before Python 3.11.4 a broken pipe that nobody has asked about is printed.
+            # Python before 3.11.4 prints an unretrieved broken pipe.
             with contextlib.suppress(OSError):
                 await asyncio.wait_for(self._write.wait_closed(), 2.0)
-        await self._all_complaints()
+        await self._all_stderr()
 
-    async def _ping(self) -> None:
-        """A robot that hears nothing for long takes the laptop for gone."""
+    async def _send_keep_alive(self) -> None:
         with contextlib.suppress(ConnectionError):
             while True:
-                await asyncio.sleep(_PING_S)
+                await asyncio.sleep(_KEEP_ALIVE_S)
                 self._write.write(b"\n")
                 await self._write.drain()
 
-    async def _all_complaints(self) -> str:
-        # A helper that ssh's configuration starts may hold the pipe open after ssh has ended.
+    async def _all_stderr(self) -> str:
+        # A helper process from ssh's configuration may keep the pipe open after ssh has ended.
         with contextlib.suppress(TimeoutError):
-            return await asyncio.wait_for(self._complaints, 2.0)
+            return await asyncio.wait_for(self._stderr, 2.0)
         return ""
 
-    async def _last_words(self) -> str:
+    async def _read_stderr(self) -> str:
         assert self._process.stderr is not None
         return (await self._process.stderr.read()).decode(errors="replace")
 
 
 @contextlib.asynccontextmanager
 async def connect(
-    config: FleetConfig, robot: RobotHost, say: Say = lambda _: None
+    config: FleetConfig, robot: RobotHost, on_progress: OnProgress = lambda _: None
 ) -> AsyncIterator[Session]:
-    """A session; `say` hears how far calls are. Raises UnreachableError."""
+    """Open a session; `on_progress` gets the steps of each call. Raises UnreachableError."""
     modules = (raw_mavlink, agent)
     sources = [(m.__name__, Path(str(m.__file__)).read_text("utf-8")) for m in modules]
     payload = json.dumps(sources).encode()
-    # Python 3.6 would take the robot's texts for ASCII.
+    # Python 3.6 would read and write ASCII otherwise.
     python = f"env LC_ALL=C.UTF-8 python3 -u -c {shlex.quote(_BOOTSTRAP.format(size=len(payload)))}"
     process = await asyncio.create_subprocess_exec(
         *ssh_command(config, robot), as_root(python),
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE, limit=1 << 24,
-        # Ctrl-C is for the laptop's program, which ends the sessions in order.
+        # So that Ctrl-C does not kill ssh: this program closes the sessions.
         process_group=0,
     )  # fmt: skip
-    session = Session(robot, process, say)
+    session = Session(robot, process, on_progress)
     try:
         assert process.stdin is not None
         process.stdin.write(payload)
@@ -258,10 +261,10 @@ async def rsync(
     sudo: bool = False,
     on_share: Callable[[float], None] = lambda _: None,
 ) -> int:
-    """Copy by rsync, contents compared by checksum; how many bytes of content travelled.
+    """Copy by rsync, comparing checksums; return how many bytes of content were transferred.
 
-    `sources` and `target` are rsync's; the robot's side begins with ":". `on_share` hears the share
-    that is done. Raises FleetError.
+    `sources` and `target` are as for rsync; paths on the robot begin with ":". `on_share` gets the
+    share done, 0 to 1. Raises FleetError.
     """
     shell = shlex.join(ssh_command(config, robot)[:-1])
     host = f"[{robot.host}]" if ":" in robot.host else robot.host
@@ -277,7 +280,7 @@ async def rsync(
         stderr=asyncio.subprocess.PIPE, process_group=0,
     )  # fmt: skip
     assert process.stdout is not None and process.stderr is not None
-    complaints = asyncio.create_task(process.stderr.read())
+    stderr = asyncio.create_task(process.stderr.read())
     text, percent = "", 0
     try:
         while data := await process.stdout.read(4096):
@@ -291,8 +294,8 @@ async def rsync(
         if process.returncode is None:
             process.kill()
             await process.wait()
-    words = (await complaints).decode(errors="replace")
+    errors = (await stderr).decode(errors="replace")
     if process.returncode != 0:
-        raise UnreachableError(explain(words, robot.host))
+        raise UnreachableError(explain(errors, robot.host))
     literal = re.search(r"Literal data: (\d+)", text)
     return int(literal[1]) if literal else 0

@@ -1,8 +1,8 @@
-"""fleet.toml: which robots there are, how to reach them, and who flies where.
+"""fleet.toml: the fleet's robots, how to reach them, and their slots.
 
 A robot is a computer with a vehicle; a slot is a place in the flight: pad, height, landing point.
-A robot without a slot is a spare. Relative paths are meant from the file's own folder, "~" is the
-user's. Every mistake is one line that names the file, the key, the robot and what is allowed.
+A robot without a slot is a spare. Paths are relative to the file's folder; "~" is the user's home.
+An error is one line that names the file, the key, the robot and what is allowed.
 """
 
 import itertools
@@ -34,13 +34,13 @@ from lpac.radio.airtime import Transport
 
 DEFAULT_DIRECTORY = "/opt/lpac"
 
-# Where fleets' keys are if the file does not say: not beside it, where repositories are.
+# Default folder of keys: not beside the file, which may be in a repository.
 _KEYS = "~/.local/share/lpac/keys"
 _MAX_CPU = 1023
 
 _GROUP = "239.255.76.80:7450"
 
-# These stand on the command lines of ssh, and in files of systemd.
+# These get on ssh's command lines and into systemd's files.
 _User = Annotated[
     str,
     Meta(
@@ -63,28 +63,28 @@ _Path = Annotated[str, Meta(min_length=1, description="a path")]
 _Port = Annotated[int, Meta(ge=1, le=65535)]
 _CPUS = re.compile(r"([0-9]{1,4})(?:-([0-9]{1,4}))?")
 
-# Keys of robot.toml that [robot] must not have, and where they come from.
-_ELSEWHERE = {
+# Keys of robot.toml that [robot] must not have, and where they are set instead.
+_SET_ELSEWHERE = {
     "fleet": "it is `fleet` at the top of the file",
     "robot_id": "it is `robot_id` in [robots.NAME]",
     "policy.bundle": "it is `bundle` at the top of the file",
     "policy.world": "it is `world` at the top of the file",
     "autopilot.system_id": "it is `system_id` in [robots.NAME]",
     "identity": "it follows from `keys` at the top of the file",
-    "link": "it follows from [radio], and `address` and `zenoh_port` in [robots.NAME]; a radio of "
-    "your own is `type` and `options` in [radio]",
+    "link": "it follows from [radio], and `address` and `zenoh_port` in [robots.NAME]; for your "
+    "own radio set `type` and `options` in [radio]",
     "flight.slot": "it is `height` in [[slots]]",
     "flight.landing_point_m": "it is `landing_point_m` in [[slots]]",
     "log.folder": "robots log to /var/lib/lpac/logs",
 }
-_OF_ONE_ROBOT_ELSEWHERE = _ELSEWHERE | {
+_SET_ELSEWHERE_FOR_ONE = _SET_ELSEWHERE | {
     "autopilot.url": "it is `mavlink_url` in [robots.NAME]",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class SshConfig(Bounded):
-    """`config` is the file for `ssh -F`; empty: OpenSSH's own files."""
+    """Options of ssh. `config` is the file for `ssh -F`; empty for OpenSSH's own files."""
 
     config: str = ""
     connect_timeout_s: Annotated[float, Meta(ge=1.0, le=300.0)] = 5.0
@@ -92,18 +92,18 @@ class SshConfig(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class RadioConfig(Bounded):
-    """How robots' messages get to the others.
+    """How messages travel between robots.
 
-    "mesh": each robot is connected to each, and sends to them one by one. "multicast": robots send
-    to all at once, in `group` (multicast address and port). In both each ground is connected to all
-    robots. `type` and `options` are robot.toml's `link.type` and `link.options`: a radio of your
-    own, which is told all of this too.
+    "mesh": every robot connects to every other and sends to each. "multicast": a robot sends to all
+    at once, in `group` (multicast address and port). A ground connects to all robots either way.
+    `type` and `options` are robot.toml's `link.type` and `link.options`, for your own radio, which
+    gets the other settings too.
     """
 
     transport: Transport = "mesh"
     group: str = _GROUP
     type: Annotated[
-        str, Meta(min_length=1, description="'zenoh', or the name of a radio of your own")
+        str, Meta(min_length=1, description="'zenoh', or the name of your own radio")
     ] = "zenoh"
     options: dict[str, object] = field(default_factory=dict, hash=False)
 
@@ -117,10 +117,9 @@ class RadioConfig(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class Slot(Bounded):
-    """A place in the flight; `robot` is None where it is free.
+    """A place in the flight; `robot` is None if it is free.
 
-    `height` is robot.toml's `flight.slot`; `pad_m` and `landing_point_m` are (x, y) of the mission
-    frame.
+    `height` is robot.toml's `flight.slot`. `pad_m` and `landing_point_m` are (x, y), mission frame.
     """
 
     height: SlotNumber
@@ -133,10 +132,10 @@ class Slot(Bounded):
 class RobotHost:
     """A robot, and how to reach it.
 
-    `host`, `user` and `port` are for ssh; `host` may be a name from its configuration, which also
-    decides where `port` is None. `address` (IPv4) and `zenoh_port` are where the other robots reach
-    it. `mavlink_url` is where PX4's datagrams come in, `system_id` its MAV_SYS_ID. `cpus` are where
-    its program may run, empty: on all. `overrides` are its own values of robot.toml.
+    `host`, `user` and `port` are for ssh; `host` may be a name from ssh's configuration, which also
+    applies if `port` is None. The other robots connect to `address` (IPv4) and `zenoh_port`. PX4
+    sends MAVLink to `mavlink_url`; `system_id` is its MAV_SYS_ID. The program runs on `cpus`, empty
+    for all. `overrides` are the robot's own values of robot.toml.
     """
 
     name: str
@@ -153,7 +152,7 @@ class RobotHost:
 
     @property
     def has_computer(self) -> bool:
-        """Whether it is on a computer that ssh could reach; those of `lpac sim` are not."""
+        """Whether ssh can reach its computer; False for robots of `lpac sim`."""
         return not self.host.endswith(".invalid")
 
     @property
@@ -163,8 +162,8 @@ class RobotHost:
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
-    """A robot's paths (bundle, world, identity, logs), and the address it listens on."""
+class RobotPaths:
+    """Paths in a robot.toml, and the address that the robot listens on."""
 
     bundle: str
     world: str
@@ -173,22 +172,21 @@ class Places:
     listen: str
 
 
-# A release lies at /release in the sandbox of the robot's unit.
-# At power-up, or while the access point is away, it may not have its own address yet: it listens on
-# whatever it has.
-IN_RELEASE = Places(
+# In the unit's sandbox, whose working directory is /release. The robot listens on all addresses,
+# since it may not have its own one yet at boot or without the access point.
+IN_RELEASE = RobotPaths(
     "bundle", "world.env", "/var/lib/lpac/identity", "/var/lib/lpac/logs", "0.0.0.0"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class FleetConfig:
-    """All of fleet.toml, checked as a whole; `shared` is what all robots' robot.toml have.
+    """A checked fleet.toml; `shared` are the values of robot.toml that all robots have.
 
     `directory` is the robots' folder of releases; `predecessors` are containers and units that must
-    not run beside ours. `keys` is the folder of this computer's own identity in the fleet; None if
-    nobody has one: all of it is on this computer, or it is `insecure`, and whoever reaches the
-    radio can fly it.
+    not run beside the robot's program. `keys` is the folder of this computer's identity in the
+    fleet. It is None without keys: in a fleet that is all on this computer, or is `insecure`
+    (anyone who reaches the radio can fly it).
     """
 
     path: Path
@@ -212,57 +210,60 @@ class FleetConfig:
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """Zenoh endpoints of the robots."""
+        """Zenoh endpoints of all robots."""
         return tuple(map(self.endpoint, self.robots.values()))
 
     @property
     def scheme(self) -> str:
-        """Of zenoh's endpoints."""
+        """Protocol of the zenoh endpoints."""
         return "tcp" if self.keys is None else "tls"
 
     def slot_of(self, name: str) -> Slot | None:
-        """The robot's slot; None for a spare."""
+        """Slot of the robot; None for a spare."""
         return next((slot for slot in self.slots if slot.robot == name), None)
 
     def free_ground(self) -> Margin | None:
-        """How far around the fence nobody may be, whatever fails; None if no robot flies.
+        """Distance around the fence that must be free of people, whatever fails.
 
-        The greatest of all robots' margins, each from its own fence.
+        The greatest of all robots' margins, each from its own fence; None if no robot has a slot.
         """
         flying = [(i, self.robots[s.robot]) for i, s in enumerate(self.slots) if s.robot]
         margins = [_robot_config(self, robot, i).free_ground for i, robot in flying]
         return max(margins, default=None)
 
     def values_of(self, robot: RobotHost) -> dict[str, Any]:
-        """Settings of the robot's robot.toml: [robot], and its own values over them."""
+        """The robot's values of robot.toml: [robot], overridden by its own."""
         return _merged(self.shared, robot.overrides)
 
-    def robot_mapping(self, name: str, places: Places) -> dict[str, Any]:
-        """The robot's robot.toml, as a mapping. Raises ConfigError for who has none."""
+    def robot_mapping(self, name: str, paths: RobotPaths) -> dict[str, Any]:
+        """The robot's robot.toml as a mapping.
+
+        Raises ConfigError for an unknown robot or a spare.
+        """
         (robot,) = select(self, name)
         slot = self.slot_of(name)
         if slot is None:
-            raise ConfigError(f"{self.path}: robots.{name}: is a spare: it sits in no slot")
-        return _robot_mapping(self, robot, slot, places)
+            raise ConfigError(f"{self.path}: robots.{name}: is a spare: it has no slot")
+        return _robot_mapping(self, robot, slot, paths)
 
     def robot_config(self, name: str) -> RobotConfig:
-        """Configuration that the robot flies by. Raises ConfigError for a stranger or a spare."""
+        """The robot's configuration. Raises ConfigError for an unknown robot or a spare."""
         return from_mapping(RobotConfig, self.robot_mapping(name, IN_RELEASE), str(self.path))
 
 
 def load_fleet(path: Path) -> FleetConfig:
-    """The fleet in the file, its paths made absolute. Raises ConfigError."""
+    """Load a fleet.toml, with absolute paths. Raises ConfigError."""
     return parse_fleet(path, read_fleet(path))
 
 
 def select(config: FleetConfig, names: str | None) -> list[RobotHost]:
-    """The robots of a list such as "r1,r3", or all: in the order of the slots, then the spares.
+    """Robots of a list such as "r1,r3" (None: all), in the order of the slots, then the spares.
 
-    Raises ConfigError for a name that is unknown, or if there is no robot.
+    Raises ConfigError for an unknown name or if there is no robot.
     """
     flying = [slot.robot for slot in config.slots if slot.robot is not None]
     order = list(dict.fromkeys([*flying, *config.robots]))
-    known = f"known are {', '.join(order)}" if order else "it has no robots yet"
+    known = f"known are {', '.join(order)}" if order else "the file has no robots yet"
     asked = order if names is None else [n for n in map(str.strip, names.split(",")) if n]
     for name in asked:
         if name not in config.robots:
@@ -272,12 +273,9 @@ def select(config: FleetConfig, names: str | None) -> list[RobotHost]:
     return [config.robots[name] for name in order if name in asked]
 
 
-# Reading
-
-
 @dataclass(frozen=True, slots=True)
 class RobotTable(Bounded):
-    """[robots.NAME] as it is written."""
+    """Table [robots.NAME] of the file."""
 
     host: str
     robot_id: RobotId
@@ -296,12 +294,12 @@ class RobotTable(Bounded):
             raise ValueError(
                 f"system_id is missing: robot_id = {self.robot_id} is not from 1 to 255"
             )
-        if self.address is not None and not is_of_computer(self.address):
+        if self.address is not None and not is_host_address(self.address):
             raise ValueError(f"address = {self.address!r}: must be a computer's own IPv4 address")
-        if self.address is None and not is_of_computer(self.host):
+        if self.address is None and not is_host_address(self.host):
             raise ValueError(
-                f"address is missing: host = {self.host!r} is no IPv4 address, by which the other "
-                "robots could reach it"
+                f"address is missing: host = {self.host!r} is not an IPv4 address, which the other "
+                "robots need"
             )
         if self.mavlink_url is not None:
             require_url("mavlink_url", self.mavlink_url)
@@ -310,7 +308,7 @@ class RobotTable(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class FleetTable(Bounded):
-    """fleet.toml as it is written."""
+    """The whole file."""
 
     fleet: PlainName
     image: _Path
@@ -328,33 +326,31 @@ class FleetTable(Bounded):
 
     def check_rules(self) -> None:
         if self.insecure and self.keys:
-            raise ValueError("insecure = true: not with keys: leave one of them out")
+            raise ValueError("insecure = true: excludes keys: remove one of them")
 
 
 def read_fleet(path: Path) -> str:
-    """The file's text, its ends of lines as they are. Raises ConfigError."""
+    """Text of the file with its own line endings. Raises ConfigError."""
     if not path.exists():
-        raise ConfigError(
-            f"{path}: cannot be read: there is no such file: give --fleet, or set LPAC_FLEET"
-        )
+        raise ConfigError(f"{path}: cannot be read: no such file: give --fleet, or set LPAC_FLEET")
     return read_toml_text(path)
 
 
 def parse_fleet(path: Path, text: str) -> FleetConfig:
-    """The fleet that a file of this text would describe. Raises ConfigError."""
+    """Parse the text of a fleet.toml at `path`. Raises ConfigError."""
     mapping = parse_toml(text, path)
     slots = mapping.get("slots")
     if isinstance(slots, list) and all(isinstance(slot, dict) for slot in slots):
         mapping["slots"] = [{"height": i} | _without_empty(slot) for i, slot in enumerate(slots)]
     table = from_mapping(FleetTable, mapping, str(path))
-    _check_keys(table.robot, _ELSEWHERE, f"{path}: robot")
+    _check_keys(table.robot, _SET_ELSEWHERE, f"{path}: robot")
     folder = path.resolve().parent
 
     def place(text: str) -> Path:
         try:
             return folder / Path(text).expanduser()
         except RuntimeError:
-            raise ConfigError(f"{path}: {text!r}: whose home folder that is is not known") from None
+            raise ConfigError(f"{path}: {text!r}: unknown user: no home folder") from None
 
     config = FleetConfig(
         path=path,
@@ -378,17 +374,17 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
         insecure=table.insecure,
         radio=table.radio,
     )
-    needs_keys = not table.insecure and not _is_all_here(config)
+    needs_keys = not table.insecure and not _is_local(config)
     if table.keys or needs_keys:
         config = replace(config, keys=place(table.keys or f"{_KEYS}/{table.fleet}"))
-    for mistake in itertools.chain(_shared_by_two(config), _sittings(config)):
+    for mistake in itertools.chain(_duplicates(config), _slot_mistakes(config)):
         raise ConfigError(f"{path}: {mistake}")
     _check_flights(config)
     return config
 
 
-def _is_all_here(config: FleetConfig) -> bool:
-    """Whether it is a fleet that this computer simulates."""
+def _is_local(config: FleetConfig) -> bool:
+    """Whether all robots are on this computer, as in a simulation."""
     return bool(config.robots) and all(map(is_loopback_endpoint, config.endpoints))
 
 
@@ -398,7 +394,7 @@ def _without_empty(slot: Mapping[str, Any]) -> dict[str, Any]:
 
 def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) -> RobotHost:
     table = from_mapping(RobotTable, mapping, where)
-    _check_keys(table.robot, _OF_ONE_ROBOT_ELSEWHERE, f"{where}.robot")
+    _check_keys(table.robot, _SET_ELSEWHERE_FOR_ONE, f"{where}.robot")
     autopilot = from_mapping(
         AutopilotConfig,
         {
@@ -423,14 +419,14 @@ def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) ->
     )
 
 
-def is_of_computer(text: str) -> bool:
-    """Whether it is an IPv4 address by which others can reach one: not 0.0.0.0, no multicast."""
+def is_host_address(text: str) -> bool:
+    """Whether it is an IPv4 address of a host: not 0.0.0.0, not multicast."""
     address = ipv4(text)
     return address is not None and 1 <= address.packed[0] <= 223
 
 
 def _cpus(text: str) -> tuple[int, ...]:
-    """The processors of a list such as "0,4-6"."""
+    """Parse a list of CPUs such as "0,4-6"."""
     cpus: set[int] = set()
     for part in text.replace(" ", "").split(",") if text else ():
         match = _CPUS.fullmatch(part)
@@ -444,7 +440,7 @@ def _cpus(text: str) -> tuple[int, ...]:
 
 
 def _check_keys(table: Mapping[str, Any], elsewhere: Mapping[str, str], where: str) -> None:
-    """Raises ConfigError for a key of robot.toml that comes from elsewhere."""
+    """Raises ConfigError for a key of robot.toml that is set elsewhere."""
     for key, place in elsewhere.items():
         head, _, rest = key.partition(".")
         inner = table.get(head, {})
@@ -454,7 +450,7 @@ def _check_keys(table: Mapping[str, Any], elsewhere: Mapping[str, str], where: s
             raise ConfigError(f"{where}: {key} must not be set here: {place}")
 
 
-def _shared_by_two(config: FleetConfig) -> Iterator[str]:
+def _duplicates(config: FleetConfig) -> Iterator[str]:
     owners: dict[str, str] = {}
     for robot in config.robots.values():
         for value in (
@@ -468,7 +464,7 @@ def _shared_by_two(config: FleetConfig) -> Iterator[str]:
                 yield f"robots.{robot.name}: {value}: robot {owner} has it too"
 
 
-def _sittings(config: FleetConfig) -> Iterator[str]:
+def _slot_mistakes(config: FleetConfig) -> Iterator[str]:
     for i, slot in enumerate(config.slots):
         if slot.robot is not None and slot.robot not in config.robots:
             known = ", ".join(config.robots) or "none"
@@ -478,27 +474,22 @@ def _sittings(config: FleetConfig) -> Iterator[str]:
                 yield f"slots[{i}]: robot = {slot.robot!r}: slots[{j}] has it too"
             if slot.height == other.height:
                 yield (
-                    f"slots[{i}]{_sitting(slot)}: height = {slot.height}: slots[{j}]"
-                    f"{_sitting(other)} has it too"
+                    f"slots[{i}]{_occupant(slot)}: height = {slot.height}: slots[{j}]"
+                    f"{_occupant(other)} has it too"
                 )
 
 
-def _sitting(slot: Slot) -> str:
+def _occupant(slot: Slot) -> str:
     return f" (robot {slot.robot})" if slot.robot is not None else ""
 
 
-# What robots read, and whether they can fly so
-
-
 def _robot_mapping(
-    config: FleetConfig, robot: RobotHost, slot: Slot, places: Places
+    config: FleetConfig, robot: RobotHost, slot: Slot, paths: RobotPaths
 ) -> dict[str, Any]:
-    """The robot's robot.toml, in that slot."""
-    # A fleet that is all on this computer needs no keys, and nobody else reaches it.
-    listen = places.listen if config.keys or config.insecure else "127.0.0.1"
-    link: dict[str, Any] = {
-        "listen": [f"{config.scheme}/{listen}:{robot.zenoh_port}"],
-    }
+    """The robot's robot.toml if it had that slot."""
+    # A local fleet without keys must not be reachable from elsewhere.
+    listen = paths.listen if config.keys or config.insecure else "127.0.0.1"
+    link: dict[str, Any] = {"listen": [f"{config.scheme}/{listen}:{robot.zenoh_port}"]}
     if config.radio.transport == "mesh":
         earlier = (other for other in config.robots.values() if other.robot_id < robot.robot_id)
         link["connect"] = list(map(config.endpoint, sorted(earlier, key=lambda r: r.robot_id)))
@@ -506,24 +497,24 @@ def _robot_mapping(
         link |= {"group": config.radio.group, "interface": robot.address}
     if config.radio.type != "zenoh":
         link |= {"type": config.radio.type, "options": config.radio.options}
-    own = {
+    if config.insecure:
+        link["insecure"] = True
+    own: dict[str, Any] = {
         "fleet": config.fleet,
         "robot_id": robot.robot_id,
-        "policy": {"bundle": places.bundle, "world": places.world},
+        "policy": {"bundle": paths.bundle, "world": paths.world},
         "autopilot": {"url": robot.mavlink_url, "system_id": robot.system_id},
-        "link": {
-            **link,
-            **({"insecure": True} if config.insecure else {}),
-        },
+        "link": link,
         "flight": {"slot": slot.height, "landing_point_m": list(slot.landing_point_m)},
-        "log": {"folder": places.logs},
-        **({} if config.keys is None else {"identity": {"folder": places.identity}}),
+        "log": {"folder": paths.logs},
     }
+    if config.keys is not None:
+        own["identity"] = {"folder": paths.identity}
     return _merged(config.values_of(robot), own)
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Both tables and the tables in them; what is in both comes from `above`."""
+    """Merge two tables recursively; `above` takes precedence."""
     merged = dict(below)
     for key, value in above.items():
         inner = merged.get(key)
@@ -536,19 +527,19 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 
 
 def _check_flights(config: FleetConfig) -> None:
-    """Raises ConfigError unless every robot could fly, a spare in the first slot."""
+    """Raises ConfigError unless every robot can fly in its slot, and a spare in the first."""
     if not (config.robots and config.slots):
         return
-    anyone = next(iter(config.robots.values()))
+    first = next(iter(config.robots.values()))
     flights = []
     for i, slot in enumerate(config.slots):
-        robot = anyone if slot.robot is None else config.robots[slot.robot]
+        robot = first if slot.robot is None else config.robots[slot.robot]
         flights.append(_robot_config(config, robot, i))
     for robot in config.robots.values():
         if config.slot_of(robot.name) is None:
             _robot_config(config, robot, 0)
     for i, (slot, flight) in enumerate(zip(config.slots, flights, strict=True)):
-        where = f"{config.path}: slots[{i}]{_sitting(slot)}"
+        where = f"{config.path}: slots[{i}]{_occupant(slot)}"
         fence = flight.fence
         if not fence.distance_m(*slot.pad_m) >= fence.buffer_m:
             raise ConfigError(
@@ -556,25 +547,25 @@ def _check_flights(config: FleetConfig) -> None:
                 f"buffer_m = {fence.buffer_m:g} from its line"
             )
         for j, (other, its) in enumerate(zip(config.slots[:i], flights[:i], strict=True)):
-            beside = f"slots[{j}]{_sitting(other)}"
+            neighbour = f"slots[{j}]{_occupant(other)}"
             separation_m = max(flight.flight.min_separation_m, its.flight.min_separation_m)
-            places = places_apart(flight.errors.position_m, its.errors.position_m)
-            places = places.or_at_least(separation_m, "min_separation_m")
-            # Who does not take off stands on his pad while the others land.
-            for name, beside_name in itertools.product(("pad_m", "landing_point_m"), repeat=2):
-                apart_m = math.dist(getattr(slot, name), getattr(other, beside_name))
-                if not places.holds(apart_m):
+            margin = places_apart(flight.errors.position_m, its.errors.position_m)
+            margin = margin.or_at_least(separation_m, "min_separation_m")
+            # Pads count too: a robot that did not take off stays there while the others land.
+            for name, its_name in itertools.product(("pad_m", "landing_point_m"), repeat=2):
+                apart_m = math.dist(getattr(slot, name), getattr(other, its_name))
+                if not margin.holds(apart_m):
                     raise ConfigError(
                         f"{where}: {name} = {list(getattr(slot, name))}: is {apart_m:.1f} m from "
-                        f"{beside_name} of {beside}, {places}"
+                        f"{its_name} of {neighbour}, {margin}"
                     )
-            heights = max(flight.errors.slot_spacing, its.errors.slot_spacing)
-            heights = heights.or_at_least(separation_m, "min_separation_m")
+            margin = max(flight.errors.slot_spacing, its.errors.slot_spacing)
+            margin = margin.or_at_least(separation_m, "min_separation_m")
             apart_m = abs(flight.flight.slot_height_m - its.flight.slot_height_m)
-            if not heights.holds(apart_m):
+            if not margin.holds(apart_m):
                 raise ConfigError(
                     f"{where}: height = {slot.height}: is {flight.flight.slot_height_m:g} m, "
-                    f"{apart_m:.1f} m from that of {beside}, {heights}"
+                    f"{apart_m:.1f} m from that of {neighbour}, {margin}"
                 )
 
 

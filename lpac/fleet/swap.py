@@ -17,40 +17,39 @@ from lpac.fleet.writer import assign
 
 
 class Swapped(NamedTuple):
-    """The slot's number in the file, counted from 0, and what runs on the spare now.
+    """Result of a swap: the slot's index in the file, and what runs on the spare.
 
-    `changed` tells whether the slot was the failed robot's until now. `silent` is why that one
-    could not be stopped, None if it was. `callers` are the flying robots that call the spare by
-    their own configuration; it calls all others.
+    `changed`: the slot was the failed robot's until now. `not_stopped` is why the failed robot
+    could not be stopped, None if it was. `callers` are the robots whose configuration makes them
+    connect to the spare; the spare connects to all others.
     """
 
     slot: int
     changed: bool
     deployed: Deployed
-    silent: str | None
+    not_stopped: str | None
     callers: tuple[str, ...]
 
 
 async def swap(
     path: Path, failed: str, spare: str, report: Report, operator: Callable[[], str]
 ) -> Swapped:
-    """Let `spare` fly instead of `failed`; a repeat finishes what was interrupted.
+    """Give the slot of `failed` to `spare`. A repeat finishes an interrupted swap.
 
-    The spare is looked at, and is a member, before anything is changed, and the failed robot is
-    stopped before the spare gets its place; `operator` is as for `enroll`. Raises ConfigError, or
-    FleetError if the failed robot is armed or the spare cannot have the release; ValueError or
-    OSError if there is no release.
+    First the spare must answer and become a member, then the failed robot is stopped, then the
+    slot changes hands. `operator` is as for `enroll`. Raises ConfigError; FleetError if the failed
+    robot is armed or the release cannot be deployed; ValueError or OSError for a bad release.
     """
     config = load_fleet(path)
     index = _slot(config, failed, spare)
     changed = config.slots[index].robot == failed
     common = load_common(config)
-    report(f"look at {spare}", None)
+    report(f"check {spare}", None)
     async with hold(config, config.robots[spare], report) as held:
         report(f"key of {spare}", None)
         await join(held.session, config, config.robots[spare], operator)
     report(f"stop {failed}", None)
-    silent = await _stop(config, config.robots[failed])
+    not_stopped = await _stop(config, config.robots[failed])
     report(path.name, None)
     assign(path, index, spare)
     config = load_fleet(path)
@@ -58,30 +57,30 @@ async def swap(
     with tempfile.TemporaryDirectory(prefix="lpac-swap-") as folder:
         release = make_release(config, robot, common, Path(folder))
         deployed = await deploy(config, robot, release, report)
-    return Swapped(index, changed, deployed, silent, _callers(config, robot))
+    return Swapped(index, changed, deployed, not_stopped, _callers(config, robot))
 
 
 def _slot(config: FleetConfig, failed: str, spare: str) -> int:
-    """The slot that changes hands, or did so in an earlier try. Raises ConfigError."""
+    """Index of the slot that changes hands, or did in an earlier try. Raises ConfigError."""
     select(config, f"{failed},{spare}")
     slots = {slot.robot: index for index, slot in enumerate(config.slots)}
     if failed in slots and spare in slots:
-        raise ConfigError(f"{config.path}: {spare} is no spare: it has slots[{slots[spare]}]")
+        raise ConfigError(f"{config.path}: {spare} is not a spare: it has slots[{slots[spare]}]")
     if failed not in slots and spare not in slots:
-        raise ConfigError(f"{config.path}: {failed} has no slot that {spare} could take")
+        raise ConfigError(f"{config.path}: {failed} has no slot for {spare} to take")
     return slots[failed if failed in slots else spare]
 
 
 def _callers(config: FleetConfig, robot: RobotHost) -> tuple[str, ...]:
-    """Of two robots the one with the larger id calls the other."""
+    """Flying robots that connect to this one: of each pair, the one with the larger id does."""
     flying = (config.robots[slot.robot] for slot in config.slots if slot.robot is not None)
     return tuple(other.name for other in flying if other.robot_id > robot.robot_id)
 
 
 async def _stop(config: FleetConfig, robot: RobotHost) -> str | None:
-    """Stop the robot's program, now and at boot; why it was not found, None if it was.
+    """Stop the robot's program, now and at boot. Return why it could not be reached, or None.
 
-    Raises RemoteError if it refuses, since it flies.
+    Raises RemoteError if it is armed.
     """
     try:
         async with connect(config, robot) as session:
@@ -90,7 +89,7 @@ async def _stop(config: FleetConfig, robot: RobotHost) -> str | None:
                 check_identity(found["identity"], config, robot)
             except RemoteError as error:
                 return str(error)
-            # Without the lock: on a robot that is broken it may not be had.
+            # Without the lock, which a broken robot may not give.
             await stop(session, robot, in_flight=False, disable=True)
     except UnreachableError as error:
         return str(error)

@@ -1,4 +1,4 @@
-"""The start of a day in the field: robots that answer, clocks set, programs that run."""
+"""`lpac fleet up`: wait for the robots, set their clocks, start their programs, and decide."""
 
 import asyncio
 import math
@@ -21,38 +21,38 @@ from lpac.fleet.doctor import (
     measure_clock,
 )
 from lpac.fleet.hold import Report, lock, visit
-from lpac.fleet.members import bring_members
+from lpac.fleet.members import send_members
 from lpac.fleet.operations import Outcome
 from lpac.fleet.program import require_disarmed, start
 from lpac.fleet.session import RemoteError, Session, UnreachableError
 from lpac.fleet.settings import FleetConfig, RobotHost
 
-_ASK_AGAIN_S = 1.0
-# As `edge.drivers.identity_folder` writes it, and `edge.identity.guard` refuses it.
-_START, _MOST_AHEAD_MS = "/var/lib/private/lpac/identity/start", 24 * 3600 * 1000
-# Of what goes to a group by Wi-Fi, where the receiver is neither near nor far.
+_RETRY_S = 1.0
+# The file of `edge.drivers.identity_folder`, and the limit of `edge.identity.guard`.
+_START, _MAX_AHEAD_MS = "/var/lib/private/lpac/identity/start", 24 * 3600 * 1000
+# Share of multicast frames lost on Wi-Fi at a medium distance.
 _LOST = 0.05
 
 
-class Arrival(NamedTuple):
-    """Steps done on a robot to bring it up, and problems, in words."""
+class UpResult(NamedTuple):
+    """Steps done to bring a robot up, and problems, in words."""
 
     done: tuple[str, ...]
     problems: tuple[str, ...]
 
 
 class GoDecision(NamedTuple):
-    """Whether a robot may fly, as far as that shows on the ground; and what speaks against it."""
+    """Whether a robot may fly as far as the doctor can tell, and the reasons against it."""
 
     robot: str
     go: bool
     reasons: tuple[str, ...]
 
 
-class Pack(NamedTuple):
-    """A robot's battery: its share, and how many trials it is good for; None if not known.
+class BatteryReport(NamedTuple):
+    """A robot's battery: its charge (0 to 1) and the trials that it lasts for; None if unknown.
 
-    `endurance_s` is what a full one lasts, as measured in the last flight, or else as configured.
+    `endurance_s` is that of a full battery, as measured in the last flight or else as configured.
     """
 
     robot: str
@@ -62,11 +62,10 @@ class Pack(NamedTuple):
 
 
 class GroupCost(NamedTuple):
-    """Cost of a robot's message in a multicast group: datagrams, all of which must come.
+    """Datagrams per message in a multicast group, all of which must be received.
 
-    `datagrams` are from so many, with a map that is almost nothing, to so many, with one that does
-    not compress; `lost` is the share of messages, each of it, that are lost if one datagram of
-    twenty is. More than `MOST_FRAGMENTS` are not sent.
+    `datagrams` is the number for an empty map and for one that does not compress; `lost` the shares
+    of such messages that are lost if 5 % of datagrams are. More than `MOST_FRAGMENTS` are not sent.
     """
 
     payload: PayloadType
@@ -75,18 +74,18 @@ class GroupCost(NamedTuple):
 
 
 def group_costs(config: FleetConfig) -> list[GroupCost]:
-    """For each payload that robots of the fleet speak in; none unless they speak in a group.
+    """Cost of each payload type that the fleet's robots use; [] without multicast.
 
     Raises BundleError, ConfigError or OSError for a policy that cannot be loaded.
     """
     if config.radio.transport != "multicast":
         return []
     policy = load_policy(load_bundle(config.bundle))
-    judged = policy.manifest.payload_types
+    evaluated = policy.manifest.payload_types
     flying = [slot.robot for slot in config.slots if slot.robot is not None]
-    spoken = [config.robot_config(name).policy.payload_of(judged) for name in flying]
+    payloads = [config.robot_config(name).policy.payload_of(evaluated) for name in flying]
     costs = []
-    for payload in dict.fromkeys(spoken):
+    for payload in dict.fromkeys(payloads):
         least, most = map(frames, message_bytes(policy, payload))
         lost = 1.0 - (1.0 - _LOST) ** least, 1.0 - (1.0 - _LOST) ** most
         costs.append(GroupCost(payload, (least, most), lost))
@@ -99,22 +98,22 @@ async def bring_up(
     until_s: float,
     report: Report,
     unix_time_s: Callable[[], float] = time.time,
-) -> Arrival:
+) -> UpResult:
     """Wait for the robot, set its clock, finish an interrupted switch, start its program.
 
-    It is waited for until `until_s` of the monotonic clock. A program that was stopped on purpose
-    is not started. Raises FleetError if it does not come, or another robot answers.
+    `until_s` is the deadline on the monotonic clock. A program that was stopped on purpose is not
+    started. Raises FleetError if the robot does not answer in time or another one does.
     """
     while True:
         try:
             async with visit(config, robot, report) as (session, _):
                 return await _bring_up(config, robot, session, unix_time_s)
         except UnreachableError as error:
-            # A robot that is starting refuses connections, and breaks them off.
-            if time.monotonic() + _ASK_AGAIN_S > until_s:
+            # A booting robot refuses connections and breaks them off.
+            if time.monotonic() + _RETRY_S > until_s:
                 raise
-            report(f"waits: {error}", None)
-            await asyncio.sleep(_ASK_AGAIN_S)
+            report(f"wait: {error}", None)
+            await asyncio.sleep(_RETRY_S)
 
 
 async def _bring_up(
@@ -122,7 +121,7 @@ async def _bring_up(
     robot: RobotHost,
     session: Session,
     unix_time_s: Callable[[], float],
-) -> Arrival:
+) -> UpResult:
     done: list[str] = []
     problems: list[str] = []
     locked = is_right = False
@@ -137,118 +136,118 @@ async def _bring_up(
         is_right = abs(clock.offset_s) <= GOOD_CLOCK_OFFSET_S + clock.uncertainty_s
         if not is_right:
             await set_clock(session, robot, clock.offset_s)
-            done.append(f"its clock was set by {-clock.offset_s:+.2f} s")
+            done.append(f"clock set by {-clock.offset_s:+.2f} s")
             is_right = True
     except RemoteError as error:
         problems.append(str(error))
     if is_right and await renumber_starts(session):
         problems.append(
-            "its program started by a clock more than a day ahead, and is not listened to: "
-            f"`lpac fleet restart --robots {robot.name}`"
+            "its program was started while its clock was more than a day ahead, so its messages "
+            f"are ignored: `lpac fleet restart --robots {robot.name}`"
         )
     try:
-        brought = await bring_members(session, config)
-        done += [brought] if brought is not None else []
+        sent = await send_members(session, config)
+        done += [sent] if sent is not None else []
     except RemoteError as error:
         problems.append(str(error))
     if not locked:
-        return Arrival(tuple(done), tuple(problems))
+        return UpResult(tuple(done), tuple(problems))
     try:
         service = await session.call("service")
         idle = service["enabled"] and service["active"] != "active"
         if idle and config.slot_of(robot.name) is not None:
             await start(session, config)
-            done.append("its program was started")
+            done.append("program started")
     except RemoteError as error:
         problems.append(str(error))
-    return Arrival(tuple(done), tuple(problems))
+    return UpResult(tuple(done), tuple(problems))
 
 
 async def set_clock(session: Session, robot: RobotHost, offset_s: float) -> None:
-    """Take `offset_s` off the wall clock at once, and set the battery-backed clock if there is one.
+    """Step the wall clock back by `offset_s`, and set the battery-backed clock if there is one.
 
-    Refused while the vehicle is armed. On the ground the program may run meanwhile: it counts
-    monotonic time. Only the flight log's times jump as the clock does. Raises RemoteError.
+    Refused while the vehicle is armed. The program may run meanwhile, since it uses monotonic time;
+    only the flight log's times jump. Raises RemoteError.
     """
     await require_disarmed(session, robot, "setting the clock")
     set_it = f"import time as t; t.clock_settime(0, t.clock_gettime(0) - {offset_s!r})"
     if (await session.run("python3", "-c", set_it)).code != 0:
-        raise RemoteError(
-            "its clock cannot be set: the system does not let root do that (a container?)"
-        )
+        raise RemoteError("its clock cannot be set: its system does not allow it (a container?)")
     await session.run("sh", "-c", "ls /dev/rtc* && hwclock -w")
 
 
 async def renumber_starts(session: Session) -> bool:
-    """Number the program's starts by the clock again if the last was more than a day ahead of it.
+    """Reset the number of the program's last start if it is more than a day ahead of the clock.
 
-    Nobody listens to such a start. The clock must be right. Whether it was ahead.
+    Others ignore messages of such a start. The clock must be right. Returns whether it was ahead.
     """
-    said = await session.look({"start": f"cat {_START}", "now": "date +%s%3N"})
-    if not said["start"].isdigit() or int(said["start"]) <= int(said["now"]) + _MOST_AHEAD_MS:
+    output = await session.capture({"start": f"cat {_START}", "now": "date +%s%3N"})
+    start, now = output["start"], output["now"]
+    if not start.isdigit() or int(start) <= int(now) + _MAX_AHEAD_MS:
         return False
-    await session.write({_START: f"{said['now']}\n".encode()}, 0o600)
+    await session.write({_START: f"{now}\n".encode()}, 0o600)
     return True
 
 
-def board(
+def combine_checks(
     config: FleetConfig,
-    arrivals: Sequence[Outcome[Arrival]],
+    results: Sequence[Outcome[UpResult]],
     examinations: Sequence[Outcome[Examination]],
 ) -> list[Diagnosis]:
-    """All robots' checks: the doctor's, and what kept them from coming up."""
+    """Each robot's checks: `up`, then the doctor's."""
     examined = {diagnosis.robot: diagnosis for diagnosis in diagnose(config, examinations)}
     diagnoses = []
-    for outcome in arrivals:
+    for outcome in results:
         name = outcome.robot.name
         if outcome.value is None:
             checks = (DoctorCheck("up", "FAILED", outcome.problem or ""),)
             diagnoses.append(Diagnosis(name, checks))
             continue
         problems = "; ".join(outcome.value.problems)
-        done = "; ".join(outcome.value.done) or "nothing was to be done"
-        came = DoctorCheck("up", "FAILED", problems) if problems else DoctorCheck("up", "ok", done)
-        diagnoses.append(Diagnosis(name, (came, *examined[name].checks)))
+        done = "; ".join(outcome.value.done) or "nothing to do"
+        check = DoctorCheck("up", "FAILED", problems) if problems else DoctorCheck("up", "ok", done)
+        diagnoses.append(Diagnosis(name, (check, *examined[name].checks)))
     return diagnoses
 
 
-def packs(
+def batteries_of(
     config: FleetConfig, examinations: Sequence[Outcome[Examination]], trial_s: float
-) -> list[Pack]:
-    """Endurance of the batteries in the slots' robots, as their programs know them."""
+) -> list[BatteryReport]:
+    """Batteries of the robots with a slot, as their programs report them."""
     found = []
     for outcome in examinations:
         robot, examination = outcome.robot, outcome.value
         if examination is None or config.slot_of(robot.name) is None:
             continue
         service = examination.facts["service"]
-        said = (service["status"] or {}) if service["fresh"] else {}
-        share, endurance_s = said.get("battery"), said.get("endurance_s")
+        status = (service["status"] or {}) if service["fresh"] else {}
+        share, endurance_s = status.get("battery"), status.get("endurance_s")
         count = None
         if share is not None and endurance_s is not None:
-            flown = config.robot_config(robot.name)
-            flight, limits = flown.flight, flown.limits
+            configured = config.robot_config(robot.name)
+            flight, limits = configured.flight, configured.limits
+            vertices_m = configured.fence.vertices_m
             count = trials(
-                flown.energy,
+                configured.energy,
                 share=share,
-                min_battery=flown.preflight.min_battery,
+                min_battery=configured.preflight.min_battery,
                 battery_low=flight.battery_low,
                 battery_critical=flight.battery_critical,
                 endurance_s=endurance_s,
                 trial_s=trial_s,
                 # A mission may end anywhere.
-                away_m=max(math.dist(v, flight.landing_point_m) for v in flown.fence.vertices_m),
+                away_m=max(math.dist(vertex, flight.landing_point_m) for vertex in vertices_m),
                 slot=flight.slot,
                 slot_height_m=flight.slot_height_m,
                 max_speed_m_s=limits.max_speed_m_s,
                 max_climb_m_s=limits.max_climb_m_s,
             )
-        found.append(Pack(robot.name, share, endurance_s, count))
+        found.append(BatteryReport(robot.name, share, endurance_s, count))
     return found
 
 
 def decide(diagnosis: Diagnosis) -> GoDecision:
-    """Go or no-go: no-go for whatever failed."""
+    """Go if no check failed."""
     failed = diagnosis.failed()
     return GoDecision(
         diagnosis.robot, not failed, tuple(f"{check.name}: {check.found}" for check in failed)

@@ -1,8 +1,8 @@
-"""The live map over TLS: a certificate that browsers understand.
+"""TLS certificate for the live map.
 
-They know no Ed25519, so the fleet's authority has a second key for this alone, of which nothing
-else in the fleet depends. Its certificate is imported once in each browser, and vouches for
-addresses of private networks only, so that its key is worth little to whoever has it.
+Browsers do not support Ed25519, so the map has an authority with a key of its own, which nothing
+else relies on. Its certificate is imported once in each browser. It is constrained to addresses of
+private networks, which limits what a stolen key is worth.
 """
 
 import datetime
@@ -14,9 +14,9 @@ from typing import NamedTuple
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from lpac.fleet.authority import Authority, AuthorityError, write_file
+from lpac.fleet.authority import Authority, AuthorityError, private_pem, write_file, x509_name
 
 _KEY, _CERTIFICATE = "web-authority.key", "web-authority.pem"
 _MAP_KEY, _MAP_CERTIFICATE = "map.key", "map.pem"
@@ -33,13 +33,13 @@ _SIGNS_CERTIFICATES = x509.KeyUsage(
     encipher_only=False, decipher_only=False,
 )  # fmt: skip
 _DAY = datetime.timedelta(days=1)
-# Some browsers take none that is good for longer.
+# Some browsers accept no longer validity.
 _MAP_VALID = 397 * _DAY
 _AUTHORITY_VALID = 3650 * _DAY
 
 
 class WebCertificate(NamedTuple):
-    """Files of PEM: what browsers import, and the server's own certificate and key."""
+    """PEM files: the authority's certificate for browsers, the server's certificate and key."""
 
     authority: Path
     certificate: Path
@@ -49,14 +49,14 @@ class WebCertificate(NamedTuple):
 def web_certificate(
     authority: Authority, addresses: Sequence[str], now: datetime.datetime
 ) -> WebCertificate:
-    """A new one for a server at these IP addresses, in the keys' folder.
+    """Make a certificate for a server at these IP addresses, in the authority's folder.
 
-    Raises AuthorityError if an address is none of a private network.
+    Raises AuthorityError for an address that is not of a private network.
     """
     found = [ipaddress.ip_address(address) for address in addresses]
     for address in found:
         if not any(address in network for network in _NETWORKS):
-            raise AuthorityError(f"{address}: --tls is for addresses of private networks")
+            raise AuthorityError(f"{address}: --tls needs addresses of private networks")
     folder = authority.folder
     if not (folder / _CERTIFICATE).exists():
         _make_authority(authority, now)
@@ -66,7 +66,7 @@ def web_certificate(
     key = ec.generate_private_key(ec.SECP256R1())
     names = x509.SubjectAlternativeName([x509.IPAddress(address) for address in found])
     certificate = (
-        _unsigned(_name(authority.fleet, "map"), issuer.subject, key, now, _MAP_VALID)
+        _unsigned(_name(authority, "map"), issuer.subject, key, now, _MAP_VALID)
         .add_extension(x509.BasicConstraints(False, None), True)
         .add_extension(names, False)
         .add_extension(
@@ -76,19 +76,19 @@ def web_certificate(
         .sign(issuer_key, hashes.SHA256())
     )
     files = WebCertificate(folder / _CERTIFICATE, folder / _MAP_CERTIFICATE, folder / _MAP_KEY)
-    write_file(files.key, _pem(key), 0o600)
+    write_file(files.key, private_pem(key), 0o600)
     write_file(files.certificate, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
     return files
 
 
 def _make_authority(authority: Authority, now: datetime.datetime) -> None:
-    key, name = ec.generate_private_key(ec.SECP256R1()), _name(authority.fleet, "web authority")
+    key, name = ec.generate_private_key(ec.SECP256R1()), _name(authority, "web authority")
     certificate = (
         _unsigned(name, name, key, now, _AUTHORITY_VALID)
         .add_extension(x509.BasicConstraints(True, 0), True)
         .add_extension(_SIGNS_CERTIFICATES, True)
         .add_extension(
-            # Without a name that is permitted, all names would be.
+            # Without a permitted name, all names would be permitted.
             x509.NameConstraints(
                 [*map(x509.IPAddress, _NETWORKS), x509.DNSName("lpac.invalid")], None
             ),
@@ -96,9 +96,13 @@ def _make_authority(authority: Authority, now: datetime.datetime) -> None:
         )
         .sign(key, hashes.SHA256())
     )
-    write_file(authority.folder / _KEY, _pem(key), 0o600)
+    write_file(authority.folder / _KEY, private_pem(key), 0o600)
     data = certificate.public_bytes(serialization.Encoding.PEM)
     write_file(authority.folder / _CERTIFICATE, data, 0o644)
+
+
+def _name(authority: Authority, name: str) -> x509.Name:
+    return x509_name(authority.fleet, f"{authority.fleet}: {name}")
 
 
 def _unsigned(
@@ -114,25 +118,8 @@ def _unsigned(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        # The tablet's clock may be behind.
+        # A tablet's clock may be slow.
         .not_valid_before(now - _DAY)
         .not_valid_after(now - _DAY + valid)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False)
-    )
-
-
-def _name(fleet: str, common_name: str) -> x509.Name:
-    return x509.Name(
-        [
-            x509.NameAttribute(NameOID.ORGANIZATION_NAME, f"LPAC fleet {fleet}"),
-            x509.NameAttribute(NameOID.COMMON_NAME, f"{fleet}: {common_name}"),
-        ]
-    )
-
-
-def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
     )

@@ -1,4 +1,4 @@
-"""State of the robots' radios over SSH, and a stream of bytes to disturb them."""
+"""State of the robots' radios over SSH, and a bulk stream that loads them."""
 
 import contextlib
 import ipaddress
@@ -24,7 +24,7 @@ Interface = Mapping[str, Any]
 
 
 async def read_wifi(config: FleetConfig, robot: RobotHost, report: Report) -> list[Interface]:
-    """Its wireless interfaces as they are now (`probes.wifi_of`). Raises FleetError."""
+    """Read the robot's wireless interfaces (see `probes.wifi_of`). Raises FleetError."""
     report("connect", None)
     async with connect(config, robot) as session:
         report("radio", None)
@@ -32,9 +32,9 @@ async def read_wifi(config: FleetConfig, robot: RobotHost, report: Report) -> li
 
 
 def in_the_wifi(address: str, root: Path = Path("/")) -> bool:
-    """Whether this computer itself reaches the IPv4 address by Wi-Fi, as far as Linux tells.
+    """Whether this computer reaches the IPv4 address by Wi-Fi; False where that is not known.
 
-    `root` is where its /proc and /sys are.
+    `root` is the parent of /proc and /sys.
     """
     found = ipaddress.IPv4Address(address)
     routes: list[tuple[int, str]] = []
@@ -53,7 +53,7 @@ def in_the_wifi(address: str, root: Path = Path("/")) -> bool:
 
 
 def reading(before: Sequence[Interface], after: Sequence[Interface]) -> WifiReading:
-    """Reading of a robot's Wi-Fi between two looks: of the interface that has a network."""
+    """Rate, signal and channel use between two samples, of the connected interface."""
     now = next((one for one in after if one["connected"]), None)
     if now is None:
         return WifiReading()
@@ -66,14 +66,14 @@ def _busy_share(before: Interface, after: Interface) -> float | None:
     if any(one.get(key) is None for one in (before, after) for key in keys):
         return None
     active_ms, busy_ms = (float(after[key]) - float(before[key]) for key in keys)
-    # Some drivers begin to count anew now and then.
+    # Some drivers reset their counters.
     if before["frequency_mhz"] != after["frequency_mhz"] or active_ms <= 0.0 or busy_ms < 0.0:
         return None
     return min(busy_ms / active_ms, 1.0)
 
 
 class BulkStream:
-    """Bulk stream from a robot, as far as it came."""
+    """Bytes received of a bulk stream."""
 
     def __init__(self, robot: str) -> None:
         self.robot = robot
@@ -82,13 +82,13 @@ class BulkStream:
 
     @property
     def rate_mbit_s(self) -> float:
-        """Since the first bytes came."""
+        """Mean rate since the first bytes, Mbit/s."""
         if self._began_s is None:
             return 0.0
         return 8e-6 * self.received_bytes / max(time.monotonic() - self._began_s, 1e-3)
 
     def add(self, count: int) -> None:
-        """So many bytes came."""
+        """Count received bytes."""
         if self._began_s is None:
             self._began_s = time.monotonic()
         self.received_bytes += count
@@ -96,18 +96,18 @@ class BulkStream:
 
 @contextlib.contextmanager
 def bulk_stream(config: FleetConfig, robot: RobotHost) -> Iterator[BulkStream]:
-    """As many bytes from the robot as ssh takes, as of somebody who pulls logs, in this context.
+    """Receive as many bytes as ssh carries, as a pull of logs would, within this context.
 
-    Raises UnreachableError in the end if it broke off, or nothing came.
+    Raises UnreachableError on exit if the stream broke off or nothing was received.
     """
     ssh, *options, host = ssh_command(config, robot)
-    # Zeros are not to become small on the way.
+    # Compressed, zeros would load nothing.
     command = [ssh, "-o", "Compression=no", *options, host, "exec cat /dev/zero"]
     stream = BulkStream(robot.name)
-    # A helper that ssh's configuration starts may hold a pipe open after ssh has ended.
-    with tempfile.TemporaryFile() as complaints:
+    # A file: a helper process from ssh's configuration may keep a pipe open after ssh has ended.
+    with tempfile.TemporaryFile() as stderr:
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints,
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr,
             process_group=0,
         )  # fmt: skip
         reader = threading.Thread(target=_count, args=(process, stream), daemon=True)
@@ -120,8 +120,8 @@ def bulk_stream(config: FleetConfig, robot: RobotHost) -> Iterator[BulkStream]:
             process.wait()
             reader.join(_ENDS_WITHIN_S)
         if broken:
-            complaints.seek(0)
-            text = explain(complaints.read().decode(errors="replace"), robot.host)
+            stderr.seek(0)
+            text = explain(stderr.read().decode(errors="replace"), robot.host)
             raise UnreachableError(f"bulk stream from {robot.name}: {text}")
 
 

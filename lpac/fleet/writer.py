@@ -1,7 +1,6 @@
 """The only writer of fleet.toml and robot.toml.
 
-What it writes of a fleet is read back before it counts, so that nothing is written that
-`lpac.fleet.settings` would refuse.
+A fleet.toml is parsed before it is written, so that `lpac.fleet.settings` never refuses it.
 """
 
 import fcntl
@@ -17,28 +16,28 @@ import tomlkit
 from tomlkit.items import InlineTable
 
 from edge.core.schema import ConfigError
-from lpac.fleet.settings import IN_RELEASE, FleetConfig, Places, parse_fleet, read_fleet
+from lpac.fleet.settings import IN_RELEASE, FleetConfig, RobotPaths, parse_fleet, read_fleet
 
 
-def robot_toml(config: FleetConfig, name: str, places: Places = IN_RELEASE) -> str:
-    """The text of the robot's robot.toml. The same fleet.toml gives the same text.
+def robot_toml(config: FleetConfig, name: str, paths: RobotPaths = IN_RELEASE) -> str:
+    """Text of the robot's robot.toml; the same fleet.toml always gives the same text.
 
     Raises ConfigError for an unknown robot or a spare.
     """
-    text = tomlkit.dumps(config.robot_mapping(name, places), sort_keys=True)
+    text = tomlkit.dumps(config.robot_mapping(name, paths), sort_keys=True)
     return f"# Generated from fleet.toml for robot {name}: changes belong there.\n{text}"
 
 
-def write_robot(path: Path, config: FleetConfig, name: str, places: Places) -> None:
+def write_robot(path: Path, config: FleetConfig, name: str, paths: RobotPaths) -> None:
     """Write the robot's robot.toml. Raises ConfigError or OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(robot_toml(config, name, places))
+    path.write_text(robot_toml(config, name, paths))
 
 
 def write_fleet(path: Path, heading: str, tables: Mapping[str, Any]) -> FleetConfig:
-    """Write a new fleet.toml below a line that says where it is from; the fleet in it.
+    """Write a new fleet.toml, headed by a comment, and return its fleet.
 
-    Raises ConfigError if it would not be right; OSError.
+    Raises ConfigError if it would not be valid, or OSError.
     """
     text = f"# {heading}\n{tomlkit.dumps(tables)}"
     config = parse_fleet(path, text)
@@ -56,10 +55,10 @@ def add_robot(
     port: int | None = None,
     address: str | None = None,
 ) -> None:
-    """Add a spare to the file; nothing happens if it has this very robot.
+    """Add a spare to the file, unless it has this robot already.
 
-    Raises ConfigError if the file would not be right then, or has another robot of this name;
-    the file is then as it was.
+    Raises ConfigError, and leaves the file unchanged, if it would not be valid then or has another
+    robot of this name.
     """
     entry: dict[str, Any] = {"host": host, "robot_id": robot_id}
     entry |= {"user": user} if user != "root" else {}
@@ -73,7 +72,7 @@ def add_robot(
             if same and port in (None, there.port) and address in (None, there.address):
                 return text
             raise ConfigError(
-                f"{path}: robots.{name}: is there already, with host = {there.host!r}, user = "
+                f"{path}: robots.{name}: exists already, with host = {there.host!r}, user = "
                 f"{there.user!r}, robot_id = {there.robot_id}: change it in the file, or take "
                 "another name"
             )
@@ -98,7 +97,7 @@ def add_robot(
 def assign(path: Path, slot_index: int, robot: str | None) -> None:
     """Give the slot, counted from 0, to the robot, or free it.
 
-    Raises ConfigError if the file would not be right then; it is then as it was.
+    Raises ConfigError, and leaves the file unchanged, if it would not be valid then.
     """
 
     def change(text: str) -> str:
@@ -112,7 +111,7 @@ def assign(path: Path, slot_index: int, robot: str | None) -> None:
         if "robot" in slot or isinstance(slot, InlineTable):
             slot["robot"] = robot or ""
         else:
-            # tomlkit would put it behind the comments that head the next table.
+            # tomlkit would insert it after the comments that belong to the next table.
             slot.value.body.insert(0, (tomlkit.key("robot"), tomlkit.item(robot)))
         return tomlkit.dumps(document)
 
@@ -120,7 +119,7 @@ def assign(path: Path, slot_index: int, robot: str | None) -> None:
 
 
 def _before_slots(text: str) -> tuple[str, str]:
-    """The text up to the first slot and the comment right above it, and the rest."""
+    """Split the text before the first slot and the comment directly above it."""
     match = re.search(r"^(?:#.*\n)*\[\[\s*slots\s*\]\]", text, re.MULTILINE)
     at = match.start() if match else len(text)
     before = text[:at]
@@ -129,12 +128,12 @@ def _before_slots(text: str) -> tuple[str, str]:
 
 
 def _edit(path: Path, change: Callable[[str], str]) -> None:
-    """Replace the file's text, if it is right afterwards, at once and for good."""
+    """Replace the file atomically, if it is valid after the change."""
     path = path.resolve()
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     new = path.with_name(f".{path.name}.new")
     try:
-        # Two commands at once would each write the file without the other's change.
+        # Two concurrent commands would overwrite each other's change.
         fcntl.flock(folder, fcntl.LOCK_EX)
         text = read_fleet(path)
         changed = change(text)

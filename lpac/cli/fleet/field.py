@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
     from lpac.fleet.settings import FleetConfig, RobotHost
-    from lpac.fleet.up import Arrival, GoDecision, Pack
+    from lpac.fleet.up import BatteryReport, GoDecision, UpResult
 
 _STYLES = {"ok": GOOD, "skipped": FAINT, "warning": NOTABLE, "FAILED": BAD}
 
@@ -157,17 +157,17 @@ def up(
 
     Without --robots for all that have a slot. Nothing takes off.
     """
-    from lpac.fleet.up import board, decide, packs
+    from lpac.fleet.up import batteries_of, combine_checks, decide
 
     config, chosen = open_fleet(of.fleet, of.robots)
     until_s = time.monotonic() + timeout
     if of.robots is None:
         chosen = _in_slots(config, chosen)
-    arrivals = _arrivals(config, chosen, until_s)
-    came = [outcome.robot for outcome in arrivals if outcome.value is not None]
+    results = _bring_up(config, chosen, until_s)
+    came = [outcome.robot for outcome in results if outcome.value is not None]
     examinations = _examine(config, came)
-    diagnoses = board(config, arrivals, examinations)
-    batteries = {pack.robot: pack for pack in packs(config, examinations, trial)}
+    diagnoses = combine_checks(config, results, examinations)
+    batteries = {pack.robot: pack for pack in batteries_of(config, examinations, trial)}
     decisions = [decide(diagnosis) for diagnosis in diagnoses]
     if of.as_json:
         described = _described(diagnoses)
@@ -200,18 +200,20 @@ def _print_remarks(config: "FleetConfig", trial_s: float) -> None:
     typer.echo(f"trials: how many of {trial_s:g} s each pack lasts for; --trial SECONDS for others")
 
 
-def _arrivals(
+def _bring_up(
     config: "FleetConfig", robots: Sequence["RobotHost"], until_s: float
-) -> "list[Outcome[Arrival]]":
+) -> "list[Outcome[UpResult]]":
     from lpac.fleet.up import bring_up
 
-    async def arrive(robot: "RobotHost", report: "Report") -> "Arrival":
+    async def bring_one_up(robot: "RobotHost", report: "Report") -> "UpResult":
         return await bring_up(config, robot, until_s, report)
 
-    return run_for_each(robots, arrive)
+    return run_for_each(robots, bring_one_up)
 
 
-def _print_decisions(decisions: "Sequence[GoDecision]", batteries: "Mapping[str, Pack]") -> None:
+def _print_decisions(
+    decisions: "Sequence[GoDecision]", batteries: "Mapping[str, BatteryReport]"
+) -> None:
     rows: list[tuple[str | Text, ...]] = []
     for decision in decisions:
         word = styled("GO", GOOD) if decision.go else styled("NO-GO", BAD)

@@ -67,7 +67,7 @@ def operator(
         )
     new_member(authority, out, role, name)
     typer.echo(f"{out}: {name} is an {role} of fleet {config.fleet}")
-    bring_list(config)
+    send_list(config)
     typer.echo(
         f"move the folder to that laptop, by a way that nobody else can read, and name it there "
         f'in {fleet.name}: keys = "FOLDER"'
@@ -101,12 +101,12 @@ def _facts(member: "Member") -> dict[str, object]:
     }
 
 
-def bring_list(config: "FleetConfig") -> None:
+def send_list(config: "FleetConfig") -> None:
     """Bring the list of members to all robots that answer, and print which do not."""
-    from lpac.fleet.members import bring_members_to
+    from lpac.fleet.members import send_members_to
 
     async def one(robot: "RobotHost", report: "Report") -> None:
-        await bring_members_to(config, robot, report)
+        await send_members_to(config, robot, report)
 
     outcomes = run_for_each(tuple(config.robots.values()), one)
     if any(outcome.problem is not None for outcome in outcomes):
@@ -137,7 +137,7 @@ def revoke(
         raise ValueError(f"{why}: add --in-flight if that is what you want")
     authority.revoke(name)
     typer.echo(f"{name} is no member any more")
-    bring_list(config)
+    send_list(config)
 
 
 def _why_not_now(config: "FleetConfig", name: str) -> str:
@@ -199,7 +199,7 @@ def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
         new_member(authority, authority.folder, Role.OPERATOR, own)
         typer.echo(f"{own} has a new key: start `lpac ground` again")
     authority.renew_group_key()
-    bring_list(config)
+    send_list(config)
     for member in sorted(authority.members.members, key=lambda member: member.name):
         if member.robot_id is None and member.name != own:
             observer = " --observer" if member.role is Role.OBSERVER else ""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lpac.cli.fields import flag_of, options_of
-from lpac.cli.fleet.keys import bring_list
+from lpac.cli.fleet.keys import send_list
 from lpac.cli.fleet.progress import run_for_each, tell
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
 from lpac.cli.printing import GOOD, styled
@@ -26,7 +26,7 @@ _STEP_WIDTH = 14
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EnrolOptions:
+class EnrollOptions:
     """Arguments of `lpac fleet enroll`: the computer, and its robot's name and id."""
 
     name: Annotated[
@@ -51,8 +51,8 @@ class EnrolOptions:
     yes: Annotated[bool, "Even if it is enrolled as another robot."] = False
 
 
-@options_of(EnrolOptions)
-def enroll(of: EnrolOptions) -> None:
+@options_of(EnrollOptions)
+def enroll(of: EnrollOptions) -> None:
     """Make a computer with a vehicle a robot of the fleet; may be repeated at any time.
 
     It gets a key, a place in the fleet's file as a spare, an id, and a line in the list of members,
@@ -80,7 +80,7 @@ def enroll(of: EnrolOptions) -> None:
                 left.append(f"{name} is not ready: left to do: {', '.join(steps)}")
     finally:
         if _members(of.fleet) != before:
-            bring_list(load_fleet(of.fleet))
+            send_list(load_fleet(of.fleet))
     if left:
         raise ValueError("; ".join(left))
     are = "is" if len(names) == 1 else "are"
@@ -99,14 +99,14 @@ def _members(fleet: Path) -> bytes | None:
     return None if keys is None or not (keys / MEMBERS).exists() else (keys / MEMBERS).read_bytes()
 
 
-def _enroll(name: str, of: EnrolOptions) -> list[str]:
+def _enroll(name: str, of: EnrollOptions) -> list[str]:
     """Print each step; those that are left to do."""
     from lpac.fleet.enroll import enroll as enroll_robot
-    from lpac.fleet.setup import EnrolStep
+    from lpac.fleet.setup import EnrollStep
 
     left: list[str] = []
 
-    def on_step(step: EnrolStep) -> None:
+    def on_step(step: EnrollStep) -> None:
         _say("")
         typer.echo(f"{step.name:{_STEP_WIDTH}} {step.outcome}")
         for note in step.notes:
@@ -117,7 +117,8 @@ def _enroll(name: str, of: EnrolOptions) -> list[str]:
     asyncio.run(
         enroll_robot(
             of.fleet, name, of.host, user=of.user, port=of.port, address=of.address,
-            robot_id=of.robot_id, rename=of.yes, operator=user_at_host, on_step=on_step, say=_say,
+            robot_id=of.robot_id, rename=of.yes, operator=user_at_host, on_step=on_step,
+            on_progress=_say,
         )
     )  # fmt: skip
     return left
@@ -153,10 +154,10 @@ def _print_swapped(fleet: Path, failed: str, spare: str, swapped: "Swapped") -> 
             f"{failed}`",
             fg="yellow",
         )
-    if swapped.silent is None:
+    if swapped.not_stopped is None:
         typer.echo(f"{failed:6} stopped; it does not start at boot either")
     else:
-        typer.secho(f"{failed:6} was not stopped: {swapped.silent}", fg="yellow")
+        typer.secho(f"{failed:6} was not stopped: {swapped.not_stopped}", fg="yellow")
         typer.echo(
             f"{'':6} if it comes back, its program starts with the same height and landing point; "
             f"then it and {spare} both fail their checks and do not take off. Then run `lpac fleet "

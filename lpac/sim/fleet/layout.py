@@ -14,7 +14,7 @@ from edge.flight.margins import places_apart
 from edge.messages.mission import Origin
 from edge.policy.bundle import load_bundle, make_bundle, write_bundle
 from lpac.analysis.truth import TrueTrack
-from lpac.fleet.settings import Places
+from lpac.fleet.settings import RobotPaths
 from lpac.fleet.writer import assign, write_fleet, write_robot
 from lpac.sim.description import FIELD_SCALE, fence_around, robot_table
 from lpac.sim.px4.errors import Errors
@@ -206,9 +206,11 @@ class Layout:
                 ],
             },
         )
-        places = Places(str(self.bundle_path), "../../world.env", "identity", "logs", "127.0.0.1")
+        paths = RobotPaths(
+            str(self.bundle_path), "../../world.env", "identity", "logs", "127.0.0.1"
+        )
         for robot_id, name in enumerate(robots):
-            write_robot(folder / "robots" / str(robot_id) / "robot.toml", config, name, places)
+            write_robot(folder / "robots" / str(robot_id) / "robot.toml", config, name, paths)
         for slot in range(len(robots) - spares, len(robots)):
             assign(folder / "fleet.toml", slot, None)
 
@@ -307,7 +309,7 @@ def _pads_within(
 def _pads_apart(
     biases_m: F64, low_m: float, high_m: float, apart_m: float, rng: np.random.Generator
 ) -> F64 | None:
-    """Places (N, 2) within a square, `apart_m` from each other, and so with each of `biases_m`
+    """RobotPaths (N, 2) within a square, `apart_m` from each other, and so with each of `biases_m`
     (B, N, 2) added.
 
     Drawn in the cells of a grid, then pushed apart; None if they find no room.

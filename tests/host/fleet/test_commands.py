@@ -138,7 +138,7 @@ def test_a_robot_in_flight_refuses_unless_somebody_insists_and_is_landed_over_ss
         assert robot["service"]["active"] == "active"
         assert robot["service"]["status"]["boot_nonce"] != before
         assert land() == (
-            "its program runs: `lpac mission land` lands it, in pilot after `lpac mission rejoin`"
+            "its program runs: use `lpac mission land`, in pilot after `lpac mission rejoin`"
         )
         (robot,) = operator.json("stop", "--robots", "r2", "--in-flight").values()
         assert robot["service"]["active"] == "inactive"
@@ -150,7 +150,7 @@ def test_a_robot_in_flight_refuses_unless_somebody_insists_and_is_landed_over_ss
             listens_to = r2.vehicle.parameters["COM_RC_IN_MODE"]
             r2.vehicle.parameters["COM_RC_IN_MODE"] = 3
             r2.vehicle.pilot()
-        assert land() == "a pilot flies it (position): he lands it"
+        assert land() == "a pilot flies it (position): the pilot must land it"
         with r2.stepped:
             assert (r2.vehicle.mode, r2.vehicle.armed) == (Px4Mode.POSCTL, True)
             r2.vehicle.set_mode(Px4Mode.HOLD)
@@ -158,7 +158,7 @@ def test_a_robot_in_flight_refuses_unless_somebody_insists_and_is_landed_over_ss
         both = operator("land", "--robots", "r1,r2")
         assert both.returncode == 1
         assert "it lands" in both.stdout
-        assert "it is disarmed: nothing is to land" in both.stdout
+        assert "it is disarmed: there is nothing to land" in both.stdout
         assert both.stderr.splitlines()[-1] == "lpac: landing: 1 of 2 robots; failed: r1"
         with r2.stepped:
             assert r2.vehicle.mode is Px4Mode.LAND

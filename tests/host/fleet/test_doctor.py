@@ -21,7 +21,7 @@ from lpac.fleet.doctor import (
     diagnose,
     examine,
 )
-from lpac.fleet.members import bring_members_to, open_authority
+from lpac.fleet.members import open_authority, send_members_to
 from lpac.fleet.operations import Outcome, for_each
 from lpac.fleet.settings import RobotHost, load_fleet
 from lpac.fleet.up import bring_up
@@ -38,7 +38,7 @@ def enrolled(hosts: FrailHosts) -> FrailHosts:
         name_robot(hosts, host)
     config = load_fleet(hosts.fleet_toml)
     # The first have the list from before the others joined.
-    bring = partial(bring_members_to, config, report=unwatched)
+    bring = partial(send_members_to, config, report=unwatched)
     assert not [o for o in asyncio.run(for_each([*config.robots.values()], bring)) if o.problem]
     return hosts
 
@@ -118,9 +118,9 @@ def test_another_clock_another_vehicle_and_one_that_is_silent(enrolled: FrailHos
     finally:
         enrolled.fleet_toml.write_text(text)
     assert found["r1"]["clock"].verdict == "FAILED"
-    assert "system id 1, configured is 99" in found["r1"]["mavlink"].found
+    assert "system id 1, fleet.toml has 99" in found["r1"]["mavlink"].found
     assert "no heartbeat of PX4 at UDP port 14999" in found["r2"]["mavlink"].found
-    assert "14551, configured is 14999" in found["r2"]["vision-hub"].found
+    assert "14551, fleet.toml has 14999" in found["r2"]["vision-hub"].found
 
 
 def test_doctor_prints_a_board_and_fails(enrolled: FrailHosts) -> None:
@@ -149,7 +149,7 @@ def test_up_says_no_go_with_the_reasons(enrolled: FrailHosts) -> None:
     robots = json.loads(shown.stdout)["robots"]
     # The spare is not waited for.
     assert list(robots) == ["r1", "r2", "r3"]
-    assert "release: there is none" in robots["r1"]["reasons"]
+    assert "release: it has no release" in robots["r1"]["reasons"]
     assert robots["r3"]["reasons"] == [f"up: {SILENT}"]
 
 
@@ -207,7 +207,7 @@ def test_up_starts_what_was_switched_off_and_says_go(
     found = json.loads(shown.stdout)["robots"][host.name]
     assert shown.returncode == 0, found["reasons"]
     assert found["go"]
-    assert found["checks"][0]["found"] == "its program was started"
+    assert found["checks"][0]["found"] == "program started"
 
     # What is changed and not deployed is seen.
     text = enrolled.fleet_toml.read_text()
@@ -249,7 +249,7 @@ def test_up_gives_robots_the_key_of_their_group(enrolled: FrailHosts, tmp_path: 
         assert (lost.verdict, lost.fix) == ("FAILED", "lpac fleet up")
         arrival = asyncio.run(bring_up(config, robot, time.monotonic(), unwatched))
         number = authority.members.number
-        assert arrival == ((f"it was given the list of members {number}",), ())
+        assert arrival == ((f"list of members {number} sent",), ())
         assert kept.read_bytes() == (authority.folder / "group-keys").read_bytes()
     finally:
         enrolled.fleet_toml.write_text(text)

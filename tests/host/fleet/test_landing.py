@@ -68,7 +68,7 @@ def test_an_autopilots_heartbeat_tells_whether_it_is_armed(
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        heard = agent.hear_heartbeat(port)["heartbeat"]
+        heard = agent.receive_heartbeat(port)["heartbeat"]
     finally:
         stop.set()
         thread.join()
@@ -83,7 +83,7 @@ def test_an_autopilots_heartbeat_tells_whether_it_is_armed(
 
 @needs_root
 def test_no_heartbeat_is_silence(datagrams: tuple[int, socket.socket]) -> None:
-    assert agent.hear_heartbeat(datagrams[0], wait_s=0.2) == {"heartbeat": None}
+    assert agent.receive_heartbeat(datagrams[0], wait_s=0.2) == {"heartbeat": None}
 
 
 @needs_root
@@ -103,13 +103,11 @@ def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPat
             vehicle.take_off(math.nan)
         return bool(vehicle.position_m[2] < -1.0)
 
-    refused(
-        "^its program runs: `lpac mission land` lands it, in pilot after `lpac mission rejoin`$"
-    )
+    refused("^its program runs: use `lpac mission land`, in pilot after `lpac mission rejoin`$")
     said["fresh"] = False
     with Px4Server([Instance(Px4Link(vehicle, system_id=7), 0, port)]) as server:
         refused("^PX4 is system 7, not 8", system_id=8)
-        refused("^it is disarmed: nothing is to land$")
+        refused("^it is disarmed: there is nothing to land$")
         assert server.wait_for(takes_off, 60.0)
         with server.stepped:
             vehicle.pilot()
@@ -117,12 +115,12 @@ def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPat
         # PX4 tells it within a second.
         heard: dict[str, object] = {}
         while heard.get("mode") != "position":
-            heard = agent.hear_heartbeat(port)["heartbeat"] or {}
-        refused(r"^a pilot flies it \(position\): he lands it$")
+            heard = agent.receive_heartbeat(port)["heartbeat"] or {}
+        refused(r"^a pilot flies it \(position\): the pilot must land it$")
         with server.stepped:
             vehicle.set_mode(Px4Mode.HOLD)
         while heard.get("mode") != "hold":
-            heard = agent.hear_heartbeat(port)["heartbeat"] or {}
+            heard = agent.receive_heartbeat(port)["heartbeat"] or {}
         landed = land_it(port, 7)
         assert (landed["mode"], landed["armed"]) == ("land", True)
         assert vehicle.mode is Px4Mode.LAND
@@ -133,5 +131,5 @@ def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPat
 def test_where_nothing_is_heard_nothing_is_landed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(agent._CALLS, "service", lambda: {"fresh": False})
     (port,) = free_ports(1)
-    with pytest.raises(RemoteError, match=f"^nothing is heard of PX4 at UDP port {port}$"):
+    with pytest.raises(RemoteError, match=f"^no heartbeat of PX4 at UDP port {port}$"):
         land_it(port, 7)

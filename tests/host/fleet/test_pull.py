@@ -100,7 +100,7 @@ def test_a_robot_without_the_trial_says_so(flown: FrailHosts, tmp_path: Path) ->
         flown.fleet_toml, "pull", "--trial", "Z", "--robots", "r1,r4", "--out", tmp_path
     )
     assert done.returncode == 1
-    assert "it has nothing of trial 'Z'; it has 'A', 'B'" in done.stdout
+    assert "it has no logs of trial 'Z'; it has 'A', 'B'" in done.stdout
     assert "a spare that never flew" in done.stdout
     assert "pulled from 1 of 2 robots; failed: r1" in done.stderr
 
@@ -202,7 +202,7 @@ def test_another_file_of_the_same_name_takes_nobodys_place(
         write_ulog(host, "sess003", FIRST_S + 312.0, b"of B, continued")
         write_ulog(host, "sess002", FIRST_S + 311.0, b"of D")
         done = fetch(flown, None, tmp_path)
-        assert done.summary == "whole; files of the same names that were here are in earlier-1"
+        assert done.summary == "complete; older files of the same names are in earlier-1"
         kept = {"logs/robot-1-0001.mcap", "px4/sess002/log100.ulg"}
         assert names(folder / "earlier-1") == kept
         for name in kept:

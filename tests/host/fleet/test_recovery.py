@@ -60,7 +60,7 @@ def test_nothing_is_taken_back_under_a_pilot(laptop: Laptop) -> None:
             if step == "health":
                 stack.enter_context(armed(host))
 
-        with pytest.raises(RemoteError, match="the vehicle is armed by now"):
+        with pytest.raises(RemoteError, match="the vehicle was armed meanwhile"):
             laptop.deploy(0, release, arm)
         assert laptop.overview(0)["pending"] == release.id
     # On the ground again, whoever comes next puts it right.

@@ -42,8 +42,8 @@ def test_nothing_is_touched_where_there_is_nothing_to_swap(
     hosts: FrailHosts, fleet_file: Path
 ) -> None:
     for failed, spare, why in (
-        ("r3", "r2", "r2 is no spare: it has slots[1]"),
-        ("r4", "r4", "r4 has no slot that r4 could take"),
+        ("r3", "r2", "r2 is not a spare: it has slots[1]"),
+        ("r4", "r4", "r4 has no slot for r4 to take"),
         ("r9", "r4", "'r9' is unknown; known are"),
     ):
         done = lpac_fleet(fleet_file, "swap", failed, spare)

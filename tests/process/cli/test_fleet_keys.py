@@ -52,7 +52,7 @@ def test_an_authority_its_operators_and_who_is_revoked(fleet: Path, tmp_path: Pa
     assert "is there already: give a new folder" in error_line(again)
     assert [m["name"] for m in members(fleet)] == ["ann", "bob", "eve"]
 
-    assert "known: ann, bob, eve" in error_line(called("fleet", "revoke", "r9", "--fleet", fleet))
+    assert "members: ann, bob, eve" in error_line(called("fleet", "revoke", "r9", "--fleet", fleet))
     # Without a ground nobody knows what it does now.
     assert "add --in-flight" in error_line(called("fleet", "revoke", "bob", "--fleet", fleet))
     assert len(members(fleet)) == 3
@@ -68,7 +68,7 @@ def test_an_insecure_fleet_has_no_keys(fleet: Path) -> None:
     fleet.write_text(text)
     assert "has no keys: insecure = true" in error_line(called("fleet", "init", "--fleet", fleet))
     fleet.write_text(f'keys = "keys"\n{text}')
-    assert "insecure = true: not with keys" in error_line(called("fleet", "init", "--fleet", fleet))
+    assert "insecure = true: excludes keys" in error_line(called("fleet", "init", "--fleet", fleet))
 
 
 def test_one_robots_options_are_not_for_all(fleet: Path) -> None:

@@ -62,12 +62,12 @@ def test_only_files_are_fetched_and_not_what_links_lead_to(
     assert [line.split()[1] for line in listed.splitlines()] == [f"{state}/logs/1.mcap"]
     stage = pull._STAGE.replace(pull._PLACE, f"{tmp_path}/place-")
     puts = "".join(f"put {n}.mcap {state}/logs/{n}.mcap\n" for n in (1, 2, 3, 4))
-    assert asyncio.run(session.must("sh", "-c", f'{stage}{puts}ls "$d"')) == "1.mcap\n"
+    assert asyncio.run(session.check_output("sh", "-c", f'{stage}{puts}ls "$d"')) == "1.mcap\n"
 
 
 def test_a_tool_that_hangs_holds_nothing_up() -> None:
     commands = {"before": "echo a; echo b >&2", "hung": "echo c; sleep 60", "after": 'echo "d\'"'}
-    found = asyncio.run(LocalSession().look(commands, each_s=0.5))
+    found = asyncio.run(LocalSession().capture(commands, each_s=0.5))
     assert found == {"before": "a", "hung": "c", "after": "d'"}
 
 

@@ -79,7 +79,7 @@ def test_a_changed_list_of_members_is_brought_although_a_robot_is_not_enrolled(
 
     monkeypatch.setattr(membership, "_enroll", enroll)
     monkeypatch.setattr(membership, "_members", lambda _: next(lists))
-    monkeypatch.setattr(membership, "bring_list", lambda config: brought.extend(config.robots))
+    monkeypatch.setattr(membership, "send_list", lambda config: brought.extend(config.robots))
     result = CliRunner().invoke(app, ["fleet", "enroll", "--fleet", str(EXAMPLE)])
     assert str(result.exception) == "r2 does not answer"
     assert brought == (list(load_fleet(EXAMPLE).robots) if changed else [])

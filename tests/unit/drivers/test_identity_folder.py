@@ -311,7 +311,7 @@ def test_an_authority_says_what_it_cannot_do(authority: Authority, tmp_path: Pat
         Authority(authority.folder, "field")
     with pytest.raises(AuthorityError, match="must be from 0 to 255"):
         new_member(authority, tmp_path / "r", Role.ROBOT, "r256", 256)
-    with pytest.raises(AuthorityError, match="bob: is no member of fleet demo; known: nobody"):
+    with pytest.raises(AuthorityError, match="bob: not a member of fleet demo; members: none"):
         authority.revoke("bob")
 
 

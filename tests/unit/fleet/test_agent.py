@@ -71,7 +71,7 @@ def test_a_release_runs_only_if_every_file_is_what_the_manifest_says(tmp_path: P
     agent.check(str(tmp_path))
 
     def refused(name: str) -> None:
-        with pytest.raises(Refused, match=f"^{name} is not what the release has: deploy again$"):
+        with pytest.raises(Refused, match=f"^{name} differs from the release: deploy again$"):
             agent.check(str(tmp_path))
 
     (tmp_path / "robot.toml").write_text("a = 2")
@@ -93,7 +93,7 @@ def test_a_release_runs_only_if_every_file_is_what_the_manifest_says(tmp_path: P
     refused("link")
     for torn in ("", '{"fil', "{}", "[]", '{"files": 1}'):
         (tmp_path / "manifest.json").write_text(torn)
-        with pytest.raises(Refused, match=r"^manifest.json is not whole: deploy again$"):
+        with pytest.raises(Refused, match=r"^manifest.json is damaged: deploy again$"):
             agent.check(str(tmp_path))
 
 
@@ -154,9 +154,9 @@ def test_a_vehicle_that_is_armed_during_a_switch_is_not_restarted(
     if spare:
         make_spare(folder / "releases" / "2")
     systemd.armed = lambda: "daemon-reload" in systemd.done
-    with pytest.raises(Refused, match=r"armed by now: nothing is restarted .* switch is pending"):
+    with pytest.raises(Refused, match=r"armed meanwhile: nothing restarts .* switch is pending"):
         agent.switch(str(folder), "2", PORT)
-    assert "interrupted; the vehicle is armed by now" in str(agent._recover(str(folder), PORT))
+    assert "interrupted; the vehicle was armed meanwhile" in str(agent._recover(str(folder), PORT))
     assert systemd.done == ["daemon-reload"] and (folder / "pending").exists()
     systemd.armed = lambda: False
     assert "was finished: the robot runs" in str(agent._recover(str(folder), PORT))
@@ -167,7 +167,7 @@ def test_a_vehicle_that_is_armed_during_a_switch_is_not_restarted(
 def test_a_release_that_is_not_whole_is_not_switched_to(systemd: Systemd, tmp_path: Path) -> None:
     folder = tmp_path / "opt"
     (folder / "releases" / "2" / "manifest.json").write_text("{")
-    with pytest.raises(Refused, match=r"^manifest.json is not whole: deploy again$"):
+    with pytest.raises(Refused, match=r"^manifest.json is damaged: deploy again$"):
         agent.switch(str(folder), "2", PORT)
     assert not systemd.done and not (folder / "pending").exists()
 
@@ -190,7 +190,7 @@ def test_a_first_release_that_never_became_current_is_taken_back(
 ) -> None:
     folder = tmp_path / "opt"
     (folder / "current").unlink()
-    assert "first release" in agent._take_back(str(folder), None, PORT)
+    assert "first release" in agent._revert(str(folder), None, PORT)
     assert systemd.done == ["disable"]
 
 
@@ -230,7 +230,7 @@ def test_the_programs_word_counts_while_it_has_the_vehicle(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     heartbeat = None if heard is None else {"armed": heard}
-    monkeypatch.setattr(agent, "hear_heartbeat", lambda _: {"heartbeat": heartbeat})
+    monkeypatch.setattr(agent, "receive_heartbeat", lambda _: {"heartbeat": heartbeat})
     for active in ("active", "reloading", "deactivating"):
         state = {"active": active, "status": status}
         monkeypatch.setattr(agent, "service", lambda state=state: state)
@@ -263,7 +263,7 @@ class Robot(LocalSession):
     async def write(self, files: Mapping[str, bytes], mode: int = 0o644) -> None:
         self.changed += files
 
-    async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
+    async def capture(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
         return dict.fromkeys(commands, RUNNING)
 
 
@@ -277,7 +277,7 @@ GROUNDED: tuple[Callable[[Robot], Coroutine[Any, Any, object]], ...] = (
     lambda robot: deploy.rollback(CONFIG, R1, unwatched),
     lambda robot: pull.pull(CONFIG, R1, "A", Path(), unwatched),
     lambda robot: setup.set_vision_hub(robot, R1),
-    lambda robot: setup.retire(robot, R1, ["old"], lambda _: None),
+    lambda robot: setup.stop_predecessors(robot, R1, ["old"], lambda _: None),
     lambda robot: setup.set_up_px4(robot, CONFIG, R1, lambda _: None),
     lambda robot: program.stop(robot, R1, in_flight=False, disable=False),
     lambda robot: up.set_clock(robot, R1, 0.0),
@@ -340,7 +340,7 @@ def test_a_robot_that_flies_or_is_not_held_keeps_what_it_has(
         (lambda s: {"failures": int(s > 1.0)}, "its control loop fails", 40.25),
         (lambda s: {"ticks": 5}, "its control loop does not tick", 40.25),
         (lambda s: {"link": False}, "the radio link is not open", 40.25),
-        (lambda s: {"fresh": False}, "the program says nothing", 40.25),
+        (lambda s: {"fresh": False}, "the program reports no status", 40.25),
         (lambda s: {"active": "failed"}, "the unit is failed", 0.0),
         # One restart is no fault, if it is well then; again and again it is.
         (lambda s: {"nonce": int(s >= 1.0), "restarts": int(s >= 1.0)}, None, 3.0),
@@ -384,23 +384,25 @@ def test_a_container_engine_that_is_silent_keeps_nobody_from_being_enrolled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Silent(Robot):
-        async def look(self, commands: Mapping[str, str], *, each_s: float = 5.0) -> dict[str, str]:
+        async def capture(
+            self, commands: Mapping[str, str], *, each_s: float = 5.0
+        ) -> dict[str, str]:
             return dict.fromkeys(commands, "")
 
     monkeypatch.setattr(f"{__name__}.RUNNING", "Id=old.service\nLoadState=not-found\n")
-    step = asyncio.run(setup.retire(Silent(), R1, ["old_stack"], lambda _: None))
+    step = asyncio.run(setup.stop_predecessors(Silent(), R1, ["old_stack"], lambda _: None))
     assert step.outcome == "left to do"
     assert "docker does not answer" in step.notes[0]
     # Systemd could start what is taken for stopped.
     monkeypatch.setattr(f"{__name__}.RUNNING", "")
-    with pytest.raises(RemoteError, match="systemd says nothing of unit old_stack"):
-        asyncio.run(setup.retire(Silent(), R1, ["old_stack"], lambda _: None))
+    with pytest.raises(RemoteError, match="systemd reports nothing about unit old_stack"):
+        asyncio.run(setup.stop_predecessors(Silent(), R1, ["old_stack"], lambda _: None))
 
 
 def test_no_release_is_removed_while_the_current_one_is_not_known() -> None:
     robot, release = Robot(), Release("a", 1, IMAGE, Path(), 1)
     found = FOUND | {"number": None}
-    with pytest.raises(RemoteError, match="its current release was not read"):
+    with pytest.raises(RemoteError, match="its current release cannot be read"):
         asyncio.run(deploy._make_room(robot, CONFIG, release, found, "/opt/lpac/incoming/a"))
     assert not robot.changed
 
@@ -409,13 +411,13 @@ def test_a_program_that_could_not_start_again_is_not_stopped_for_px4(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def damaged(folder: str) -> dict[str, Any]:
-        raise Refused(f"{folder} is not what the release has: deploy again")
+        raise Refused(f"{folder} differs from the release: deploy again")
 
     robot = Robot()
     monkeypatch.setattr(agent, "armed", lambda _: False)
     monkeypatch.setitem(agent._CALLS, "check", damaged)
     monkeypatch.setitem(agent._CALLS, "service", lambda: {"active": "active"})
-    with pytest.raises(RemoteError, match="is not what the release has"):
+    with pytest.raises(RemoteError, match="differs from the release"):
         asyncio.run(setup.set_up_px4(robot, CONFIG, R1, lambda _: None))
     assert not robot.changed
 
@@ -457,7 +459,7 @@ def test_a_programs_word_is_fresh_while_it_runs(
 ) -> None:
     told = "" if age_s is None else json.dumps({"monotonic_s": 100.0 - age_s})
     shown = f"ActiveState={active}\nStatusText={told}\nNRestarts=2\nUnitFileState=enabled\n"
-    monkeypatch.setattr(agent, "must", lambda *_: shown)
+    monkeypatch.setattr(agent, "check_output", lambda *_: shown)
     monkeypatch.setattr("time.monotonic", lambda: 100.0)
     state = agent.service()
     assert (state["fresh"], state["active"]) == (fresh, active)

@@ -31,7 +31,7 @@ from lpac.fleet.laptop import rsync_version
 from lpac.fleet.members import init, open_authority
 from lpac.fleet.operations import Outcome
 from lpac.fleet.settings import FleetConfig, RadioConfig, RobotHost, SshConfig, load_fleet
-from lpac.fleet.up import decide, packs
+from lpac.fleet.up import batteries_of, decide
 from lpac.fleet.writer import robot_toml
 from tests.conftest import ROOT
 from tests.host.fleet.field import SILENT
@@ -157,7 +157,7 @@ def test_up_says_how_many_trials_the_packs_are_good_for(config: FleetConfig) -> 
         facts["service"]["status"] |= said
         return Outcome(config.robots[name], examination._replace(facts=facts), None)
 
-    full, weak, unknown = packs(
+    full, weak, unknown = batteries_of(
         config,
         [
             outcome("r1", battery=0.95, endurance_s=1000.0),
@@ -179,7 +179,7 @@ def test_an_accuracy_that_is_too_bad_for_the_landing_points_is_no_go(config: Fle
     (line,) = lines(bad, 0.9, 16.0, ErrorBudget())
     told = [failed(_C.LANDINGS_TOO_NEAR, line)]
     checks = judged(config, put("service.status.failed_checks", told))
-    assert checks["preflight"] == ("preflight", "FAILED", line, "mend what each line says")
+    assert checks["preflight"] == ("preflight", "FAILED", line, "do what each line says")
     assert not decide(Diagnosis("r1", tuple(checks.values()))).go
 
 
@@ -218,8 +218,8 @@ def test_robots_in_multicast_need_one_key(config: FleetConfig) -> None:
     sending = dataclasses.replace(config, radio=RadioConfig("multicast"))
     for keys, verdict, found in (
         ("00ff", "ok", "3 of 3 robots"),
-        (None, "FAILED", "it has none"),
-        ("11ff", "FAILED", "another one than r2, r3"),
+        (None, "FAILED", "it has no group key"),
+        ("11ff", "FAILED", "differs from that of r2, r3"),
     ):
         check = judged(sending, put("group_keys", keys))["group key"]
         assert (check.verdict, check.fix) == (verdict, "" if verdict == "ok" else "lpac fleet up")
@@ -246,17 +246,18 @@ def container(**about: object) -> list[dict[str, object]]:
 @pytest.mark.parametrize(
     ("change", "check", "verdict", "found"),
     [
-        (put("identity", None), "enrolled", "FAILED", "never enrolled"),
+        (put("identity", None), "enrolled", "FAILED", "it is not enrolled"),
         (put("identity.robot", "r2"), "enrolled", "FAILED", "answers r2 of fleet demo"),
         (put("pending", {"release": "a"}), "release", "FAILED", "interrupted"),
         *(
-            (put(f"versions.{part}", "x2"), "release", "FAILED", f"its {part} is x2, another")
+            (put(f"versions.{part}", "x2"), "release", "FAILED", f"its {part} x2 differs from")
             for part in ("image", "bundle", "world")
         ),
-        (put("robot_toml", "0" * 64), "release", "FAILED", "is not the one of fleet.toml"),
+        (put("robot_toml", "0" * 64), "release", "FAILED", "is not that of fleet.toml"),
         (put("service.active", "failed"), "program", "FAILED", "it is failed"),
-        (put("service.fresh", False), "program", "FAILED", "says nothing"),
+        (put("service.fresh", False), "program", "FAILED", "reports no status"),
         (put("service.restarts", 2), "program", "warning", "restarted 2 times"),
+        (put("service.restarts", 1), "program", "warning", "restarted 1 time"),
         (put("service.enabled", False), "program", "warning", "battery swap"),
         (put("service.status.peers", 1), "program", "warning", "1 of the 2"),
         (put("systemd", 229), "system", "FAILED", "systemd 229"),
@@ -273,14 +274,14 @@ def container(**about: object) -> list[dict[str, object]]:
             ]),
             "disk", "warning", "300 of 9000 MB free at /var",
         ),
-        (put("disks", []), "disk", "skipped", "df says nothing"),
-        (put("service.status.system_id", 9), "mavlink", "FAILED", "system id 9, configured is 1"),
+        (put("disks", []), "disk", "skipped", "df prints nothing"),
+        (put("service.status.system_id", 9), "mavlink", "FAILED", "system id 9, fleet.toml has 1"),
         (put("service.status.autopilot", False), "mavlink", "FAILED", "the autopilot is silent"),
         (put("wifi", []), "wifi", "skipped", "no wireless interface"),
         (put("px4", "1.12.3-0.1"), "px4", "FAILED", "older than 1.14"),
-        (put("units.voxl-px4.active", False), "px4", "FAILED", "voxl-px4 does not run"),
+        (put("units.voxl-px4.active", False), "px4", "FAILED", "not running: voxl-px4"),
         (put("vision_hub", None), "vision-hub", "skipped", "no voxl-vision-hub"),
-        (put("vision_hub", {"problem": "it is no JSON"}), "vision-hub", "FAILED", "no JSON"),
+        (put("vision_hub", {"problem": "not JSON"}), "vision-hub", "FAILED", "not JSON"),
         (put("vision_hub.en_localhost_mavlink_udp", False), "vision-hub", "FAILED", "not true"),
         (put("vision_hub.en_localhost_mavlink_udp", None), "vision-hub", "FAILED", "not true"),
         (put("vision_hub.offboard_mode", None), "vision-hub", "FAILED", "offboard_mode is not set"),
@@ -290,53 +291,53 @@ def container(**about: object) -> list[dict[str, object]]:
             "commanders", "FAILED", "voxl-microdds-agent runs",
         ),
         (put("units.old_ros.enabled", True), "commanders", "FAILED", "starts at the next boot"),
-        (put("drops_strangers", False), "doors", "warning", "lets root alone filter"),
+        (put("drops_strangers", False), "doors", "warning", "lets only root filter"),
         (put("members", None), "member", "FAILED", "no list of the fleet's members"),
         (put("members", "{"), "member", "FAILED", "members: does not begin with"),
         (
             put("members", f"fleet demo 1 0 {64 * 'a'}"),
-            "member", "FAILED", "its list of members is 1, and here is ",
+            "member", "FAILED", "its list of members is number 1, this computer's is ",
         ),
-        (put("factory_passwords", ["root"]), "doors", "FAILED", "root: no password, or the one"),
+        (put("factory_passwords", ["root"]), "doors", "FAILED", "root: no password, or"),
         (
             put("open_ports", [{"protocol": "udp", "port": 14556, "program": "voxl-mavlink-s"}]),
-            "doors", "warning", "may reach PX4's MAVLink: udp 14556 (voxl-mavlink-s)",
+            "doors", "warning", "MAVLink is open to the network: udp 14556 (voxl-mavlink-s)",
         ),
         (
             put("open_ports", [{"protocol": "udp", "port": 14550, "program": "?"}]),
-            "doors", "warning", "may reach PX4's MAVLink: udp 14550 (?)",
+            "doors", "warning", "MAVLink is open to the network: udp 14550 (?)",
         ),
         (
             put("open_ports", [{"protocol": "udp", "port": 7447, "program": "python3"}]),
-            "doors", "ok", "ssh and the radio alone",
+            "doors", "ok", "only ssh and the radio",
         ),
         (
             put("open_ports", [{"protocol": "tcp", "port": 80, "program": "voxl-portal"}]),
             "doors", "warning", "listen to the network: tcp 80 (voxl-portal)",
         ),
         (put("containers", None), "containers", "warning", "does not answer"),
-        (put("containers", container()), "containers", "ok", "1 run"),
+        (put("containers", container()), "containers", "ok", "1 running"),
         (put("containers", container(host_network=True)), "containers", "FAILED", "box (host"),
         (put("containers", container(devices=True)), "containers", "FAILED", "access to devices"),
         (put("containers", container(image="me/ros:1")), "containers", "FAILED", "image me/ros"),
         (
             put("containers", container(name="old_ros", running=False, restarts="always")),
-            "containers", "FAILED", "(a predecessor) comes back by itself",
+            "containers", "FAILED", "(a predecessor) starts at boot",
         ),
         (
             put("containers", container(name="old_ros", running=False, restarts="unless-stopped")),
-            "containers", "FAILED", "(a predecessor) comes back by itself",
+            "containers", "FAILED", "(a predecessor) starts at boot",
         ),
         (
             put("containers", container(name="old_ros", running=False)),
-            "containers", "ok", "0 run",
+            "containers", "ok", "0 running",
         ),
         (says(failed(_C.FAILSAFE_WRONG, "COM_X = 0")), "failsafe", "FAILED", "COM_X = 0"),
-        (says(failed(_C.FAILSAFE_NOT_READ)), "failsafe", "warning", "not read"),
-        (says(failed(_C.CHECKS_RUNNING, settles=True)), "failsafe", "warning", "not read"),
+        (says(failed(_C.FAILSAFE_NOT_READ)), "failsafe", "warning", "not been read"),
+        (says(failed(_C.CHECKS_RUNNING, settles=True)), "failsafe", "warning", "not been read"),
         (says(failed(_C.CHECKS_RUNNING, settles=True)), "preflight", "warning", "x"),
-        (says(failed(_C.AUTOPILOT_NOT_CONNECTED)), "failsafe", "warning", "not read"),
-        (says(failed(_C.TIME_NOT_KNOWN)), "preflight", "ok", "nothing but the ground"),
+        (says(failed(_C.AUTOPILOT_NOT_CONNECTED)), "failsafe", "warning", "not been read"),
+        (says(failed(_C.TIME_NOT_KNOWN)), "preflight", "ok", "only the ground's commands"),
         (says(failed(_C.GPS_NO_FIX, settles=True)), "preflight", "warning", "x"),
         (says(failed(_C.BATTERY_LOW, "40 %")), "preflight", "FAILED", "40 %"),
         (says(failed(_C.NOT_ARMABLE)), "preflight", "FAILED", "x"),
@@ -349,7 +350,7 @@ def container(**about: object) -> list[dict[str, object]]:
             "preflight", "FAILED", "x",
         ),
         (says({**failed(_C.OTHER), "code": "of_a_newer_program"}), "preflight", "FAILED", "x"),
-        (put("service.status.failed_checks_more", 1), "failsafe", "warning", "there may be more"),
+        (put("service.status.failed_checks_more", 1), "failsafe", "warning", "is cut off"),
     ],
 )  # fmt: skip
 def test_each_fault_is_named_with_its_fix(
@@ -368,7 +369,7 @@ def test_a_robot_is_judged_beside_the_others(config: FleetConfig) -> None:
     r1, fleet = config.robots["r1"], {name: well(config, name) for name in ("r1", "r2")}
     # Nobody is right where no half agrees.
     fleet["r2"].facts["versions"]["image"] = "i2"
-    assert check("release", r1, fleet).found.endswith("another one than that of r2")
+    assert check("release", r1, fleet).found.endswith("differs from that of r2")
     # Who is off has its own fault; who answers, and is heard badly, is named.
     for about, verdict, found in (
         ({"r2": PING, "r3": {**PING, "loss": 1.0}}, "ok", "1 robot: slowest answer within 3.0 ms"),
@@ -393,7 +394,7 @@ def test_a_robot_is_judged_beside_the_others(config: FleetConfig) -> None:
     assert check("wifi", r1, fleet).verdict == "ok"
     spare = config.robots["r11"]
     fleet["r11"] = fleet["r1"]
-    assert check("program", spare, fleet)[1:3] == ("FAILED", "it is a spare, and its program runs")
+    assert check("program", spare, fleet)[1:3] == ("FAILED", "it is a spare, but its program runs")
 
 
 def test_the_vehicle_is_asked_only_where_nothing_speaks_against_it(config: FleetConfig) -> None:
@@ -422,7 +423,7 @@ def test_the_quickest_exchange_tells_the_clock() -> None:
     times_s = iter([0.0, 5.3, 0.4, 1.0, 6.01, 1.02, 2.0, 7.1, 2.3, 3.0, 8.1, 3.3, 4.0, 9.1, 4.3])
 
     class Asked:
-        async def must(self, *_: str) -> str:
+        async def check_output(self, *_: str) -> str:
             return f"{next(times_s)}\n"
 
     session: Any = Asked()
@@ -506,14 +507,14 @@ NFT = '{"nftables": [{"table": {}}, {"chain": {"hook": "output", "policy": "drop
         ({}, "keys", "ok", "KEY, no agent"),
         ({"ssh-keygen -y": ""}, "keys", "FAILED", "KEY has a passphrase"),
         ({}, "sleep", "ok", "sleep.target and suspend.target are masked"),
-        ({"suspend.target": "LoadState=loaded"}, "sleep", "warning", "it may sleep"),
+        ({"suspend.target": "LoadState=loaded"}, "sleep", "warning", "may sleep when idle"),
         ({}, "clock", "ok", "set by a time server"),
-        ({"timedatectl": "no"}, "clock", "warning", "no time server has set it"),
-        ({}, "firewall", "ok", "what goes out is not dropped"),
+        ({"timedatectl": "no"}, "clock", "warning", "not set by a time server since boot"),
+        ({}, "firewall", "ok", "outgoing connections are allowed"),
         # As ufw has it: nobody connects to the laptop.
-        ({"iptables": "-P INPUT DROP"}, "firewall", "ok", "what goes out is not dropped"),
-        ({"iptables": "-P OUTPUT DROP"}, "firewall", "warning", "drops by default what goes out"),
-        ({"nft": NFT}, "firewall", "warning", "drops by default what goes out"),
+        ({"iptables": "-P INPUT DROP"}, "firewall", "ok", "outgoing connections are allowed"),
+        ({"iptables": "-P OUTPUT DROP"}, "firewall", "warning", "are dropped by default"),
+        ({"nft": NFT}, "firewall", "warning", "are dropped by default"),
         ({"iptables": "", "nft": ""}, "firewall", "skipped", "neither nft nor iptables"),
     ],
 )

@@ -34,7 +34,7 @@ from tests.conftest import ROOT
         ),
         ("rsync: connection unexpectedly closed (0 bytes received so far)", "it does not answer"),
         ("this and\n that\n", "that"),
-        ("", "it does not answer any more"),
+        ("", "it no longer answers"),
     ],
 )
 def test_last_words_mean_something(words: str, meaning: str) -> None:

@@ -18,7 +18,7 @@ from edge.core.schema import ConfigError
 from edge.robot.config import RobotConfig, load_config
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.fleet.release import drop_ins
-from lpac.fleet.settings import FleetConfig, Places, RobotHost, load_fleet, select
+from lpac.fleet.settings import FleetConfig, RobotHost, RobotPaths, load_fleet, select
 from lpac.fleet.writer import add_robot, assign, robot_toml, write_fleet, write_robot
 from tests.conftest import ROOT
 
@@ -190,7 +190,7 @@ def test_a_radio_of_ones_own_is_told_what_the_built_in_one_is(tmp_path: Path) ->
     ("lines", "told"),
     [
         ("options = {channel = 7}", "type = 'zenoh' takes none"),
-        ('type = ""', "type = '': must be 'zenoh', or the name of a radio of your own"),
+        ('type = ""', "type = '': must be 'zenoh', or the name of your own radio"),
     ],
 )
 def test_what_says_nothing_of_a_radio_is_refused(tmp_path: Path, lines: str, told: str) -> None:
@@ -572,7 +572,7 @@ def test_robots_come_in_the_order_of_the_slots(tmp_path: Path) -> None:
 def test_a_fleet_without_robots_is_one_to_begin_with(tmp_path: Path) -> None:
     text = 'fleet = "a"\nimage = "i"\nbundle = "b"\nworld = "w"\n\n[robot.autopilot]\n'
     path = fleet_file(tmp_path, text + 'url = "udpin://127.0.0.1:14551"')
-    with pytest.raises(ConfigError, match="it has no robots yet"):
+    with pytest.raises(ConfigError, match="the file has no robots yet"):
         select(load_fleet(path), None)
     add_robot(path, "r1", "10.0.0.1", 1)
     assert [robot.host for robot in select(load_fleet(path), None)] == ["10.0.0.1"]
@@ -600,7 +600,7 @@ def test_a_file_that_would_be_wrong_is_not_written(tmp_path: Path) -> None:
 
 def test_a_robot_may_have_its_files_elsewhere(tmp_path: Path) -> None:
     config = load_fleet(EXAMPLE)
-    places = Places("/policy", "field.env", "who", "kept", "127.0.0.1")
+    places = RobotPaths("/policy", "field.env", "who", "kept", "127.0.0.1")
     write_robot(tmp_path / "r2" / "robot.toml", config, "r2", places)
     robot = load_config(tmp_path / "r2" / "robot.toml")
     assert (robot.policy.bundle, robot.policy.world, robot.log.folder) == (
@@ -641,7 +641,7 @@ def test_a_robot_is_added_and_nothing_else_changes(tmp_path: Path) -> None:
     add_robot(path, "r12", "drone12", 12, user="voxl", port=2222)
     assert path.read_bytes() == added
     for other in ({"port": 22}, {"address": "10.0.0.13"}):
-        with pytest.raises(ConfigError, match="is there already"):
+        with pytest.raises(ConfigError, match="exists already"):
             add_robot(path, "r12", "drone12", 12, user="voxl", **other)
 
 
@@ -700,7 +700,7 @@ robots = {r1 = {host = "10.0.0.1", robot_id = 1}}
 @pytest.mark.parametrize(
     ("arguments", "names"),
     [
-        (("r1", "10.0.0.9", 1), ["robots.r1: is there already", "192.168.8.11"]),
+        (("r1", "10.0.0.9", 1), ["robots.r1: exists already", "192.168.8.11"]),
         (("r12", "10.0.0.9", 1), ["robots.r12: robot_id = 1: robot r1 has it too"]),
         (("r12", "-x", 12), ["robots.r12: host = '-x'"]),
         (("r12", "alias", 12), ["robots.r12: address is missing"]),

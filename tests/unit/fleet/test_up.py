@@ -14,7 +14,7 @@ from tests.conftest import ROOT
 class Robot:
     """A session with a robot whose last start was numbered by a clock far ahead."""
 
-    async def look(self, _: object) -> dict[str, str]:
+    async def capture(self, _: object) -> dict[str, str]:
         return {"start": "1800000000000", "now": "1700000000000"}
 
     async def write(self, *_: object) -> None:
@@ -35,7 +35,7 @@ def test_a_start_far_ahead_is_reported_although_the_clock_is_right_by_now(
 
     monkeypatch.setattr(up, "measure_clock", right)
     monkeypatch.setattr(up, "lock", locked)
-    monkeypatch.setattr(up, "bring_members", locked)
+    monkeypatch.setattr(up, "send_members", locked)
     config = load_fleet(ROOT / "docs" / "fleet.toml")
     robot = config.robots["r1"]
     arrival = asyncio.run(up._bring_up(config, robot, Robot(), lambda: 0.0))  # type: ignore[arg-type]
