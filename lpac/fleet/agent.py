@@ -93,10 +93,7 @@ def _send(message: Result) -> None:
 
 @call
 def run(command: List[str], timeout_s: float = 10.0) -> Result:
-    """Run a program; return its exit `code`, `out` and `err`.
-
-    Raises Refused if the program is missing or times out.
-    """
+    """Run a program: exit `code`, `out`, `err`. Raises Refused if it is missing or times out."""
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
