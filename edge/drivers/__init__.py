@@ -1,1 +1,1 @@
-"""The outside world behind the core's ports."""
+"""Drivers: implementations of `edge.core.ports` for real hardware, networks and disks."""

@@ -1,15 +1,15 @@
-"""The computer's own clocks."""
+"""System clock."""
 
 import time
 
 
 class SystemClock:
-    """The computer's own clocks."""
+    """Clock of this computer; implements `edge.core.ports.Clock`."""
 
     def monotonic_s(self) -> float:
-        """Time that never jumps."""
+        """Time that never jumps, s."""
         return time.monotonic()
 
     def unix_s(self) -> float:
-        """The wall clock."""
+        """Wall clock, s."""
         return time.time()

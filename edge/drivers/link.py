@@ -1,4 +1,4 @@
-"""The type "zenoh" of robot.toml's [link]: zenoh, and with a group multicast beside it."""
+"""Link of type "zenoh": zenoh alone, or with a multicast group for the robots' messages."""
 
 from edge.core.schema import no_options
 from edge.drivers.multicast import MulticastLink
@@ -7,7 +7,7 @@ from edge.messages.topics import MESSAGE, LinkSetting
 
 
 def zenoh_link(setting: LinkSetting) -> ZenohLink | MulticastLink:
-    """The type "zenoh" of robot.toml's [link], a context manager; it has no options.
+    """Open the link, a context manager, for `type = "zenoh"` in [link]; it has no options.
 
     Raises LinkError or ConfigError.
     """
@@ -18,7 +18,7 @@ def zenoh_link(setting: LinkSetting) -> ZenohLink | MulticastLink:
         listen=setting.listen,
         connect=setting.connect,
         scouting=setting.scouting,
-        # Robots in a group have nothing to say to each other besides: grounds call them.
+        # Robots in a group need no zenoh connections to each other; grounds connect to them.
         autoconnect=setting.group is None,
         subscriptions={
             topic: callback

@@ -1,4 +1,4 @@
-"""Log lines: JSON on standard error, for the journal, and into the flight log."""
+"""Log output of a robot: JSON lines on standard error, for the journal, and the flight log."""
 
 import os
 import time
@@ -12,7 +12,7 @@ from edge.core.ports import Recorder
 
 
 def log_to(recorder: Recorder) -> None:
-    """From now on every log line of this process goes to both. To be called once, at the start."""
+    """Send all further log lines of this process to both. Call it once, at the start."""
 
     def record(
         _logger: object, level: str, entry: MutableMapping[str, Any]
@@ -36,7 +36,7 @@ def log_to(recorder: Recorder) -> None:
 
 
 class _Journal:
-    """Writes a line for as long as somebody reads: no loop may end because nobody does any more."""
+    """Logger on standard error that never raises: a closed pipe must not end a loop."""
 
     def info(self, line: str) -> None:
         with suppress(OSError):

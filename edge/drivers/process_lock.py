@@ -1,4 +1,4 @@
-"""Lock that only one program on a machine can hold."""
+"""Lock that only one process on a machine can hold."""
 
 import errno
 import socket
@@ -7,10 +7,10 @@ from typing import Self
 
 
 class ProcessLock:
-    """A context that holds `what` for this process, against all others on this machine.
+    """Context that reserves `what` for this process.
 
-    Abstract socket names belong to the network as ports do, so containers see each other; they need
-    no file, and vanish with their process.
+    The lock is an abstract socket name. Like ports, these names are shared by all containers of one
+    network namespace. They need no file and vanish with their process.
     """
 
     def __init__(self, what: str) -> None:
@@ -18,7 +18,7 @@ class ProcessLock:
         self._socket = socket.socket(socket.AF_UNIX)
 
     def __enter__(self) -> Self:
-        """Raises OSError, in one line, if another process holds it."""
+        """Raises OSError, one line, if another process holds the lock."""
         name = f"\0lpac {self._what}"
         try:
             self._socket.bind(name)

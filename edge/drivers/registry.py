@@ -1,6 +1,6 @@
-"""Drivers that robot.toml and a bundle's manifest choose by name; packages can add to them.
+"""Registry of drivers, chosen by name in robot.toml and in a bundle's manifest.
 
-A package adds a type by an entry point, named as the type, of the group of its kind:
+A package adds a type by an entry point that has the type's name:
 
     [project.entry-points."lpac_edge.sensors"]
     camera = "my_package.camera:camera_sensor"
@@ -38,7 +38,7 @@ _VEHICLES, _LINKS = "lpac_edge.vehicles", "lpac_edge.links"
 _LEARNABLE = "lpac_edge.learnable"
 _ID_BYTES = 32
 _T = TypeVar("_T")
-# What every installation has, and no package can replace.
+# No package can replace these.
 _BUILT_IN = {
     (entry.group, entry.name): entry
     for entry in (
@@ -52,7 +52,7 @@ _BUILT_IN = {
 
 
 def load_policy(bundle: Bundle) -> Policy:
-    """The bundle's policy. Raises ConfigError for an unknown family; BundleError."""
+    """Load the bundle's policy. Raises ConfigError for an unknown family, or BundleError."""
     key, name = "policy: family", bundle.manifest.family
     family: PolicyFamily = _load(_POLICIES, name, key)
     with _as_one_line(_POLICIES, name, key):
@@ -66,7 +66,10 @@ def load_policy(bundle: Bundle) -> Policy:
 
 
 def load_verified_policy(path: Path) -> VerifiedPolicy:
-    """The policy of a bundle, tried on this CPU. Raises ConfigError, BundleError or OSError."""
+    """Load a bundle's policy, and verify it on this CPU.
+
+    Raises ConfigError, BundleError or OSError.
+    """
     bundle = load_bundle(path)
     if bundle.manifest.perception is None:
         raise BundleError(f"{path}: the bundle has no perception: it cannot fly")
@@ -77,42 +80,40 @@ def load_verified_policy(path: Path) -> VerifiedPolicy:
 
 
 def load_learnable(family: str) -> Any:
-    """The `LearnableFamily` of that name. Raises ConfigError for an unknown one."""
+    """Load the `LearnableFamily` of that name. Raises ConfigError for an unknown one."""
     return _load(_LEARNABLE, family, "network: family")
 
 
 def open_sensor(
     type_: str, options: Mapping[str, object], manifest: Manifest
 ) -> AbstractContextManager[SensorOver]:
-    """Open the sensor of [sensor], for a policy that can fly. Raises ConfigError."""
-    assert manifest.perception is not None  # without it no policy is loaded
+    """Open the sensor of [sensor] for a policy that can fly. Raises ConfigError."""
+    assert manifest.perception is not None  # checked by load_verified_policy
     driver: SensorDriver = _load(_SENSORS, type_, "sensor: type")
     training = manifest.training
     setting = SensorSetting(
         manifest.perception, training.idf_truncation, training.idf_norm, options
     )
     return _opened(
-        _SENSORS, type_, "sensor: type", partial(driver, setting), partial(_sensor_over, type_)
+        _SENSORS, type_, "sensor: type", partial(driver, setting), partial(_checked_sensor, type_)
     )
 
 
 def open_vehicle(type_: str, setting: VehicleSetting) -> AbstractContextManager[OpenVehicle]:
     """Open the vehicle of [autopilot]. Raises ConfigError for an unknown type."""
     driver: VehicleDriver = _load(_VEHICLES, type_, "autopilot: type")
-    return _opened(_VEHICLES, type_, "autopilot: type", partial(driver, setting), _vehicle)
+    return _opened(_VEHICLES, type_, "autopilot: type", partial(driver, setting), _checked_vehicle)
 
 
 def open_link(type_: str, setting: LinkSetting) -> AbstractContextManager[Link]:
     """Open the link of [link]. Raises ConfigError for an unknown type."""
     driver: LinkDriver = _load(_LINKS, type_, "link: type")
-    return _opened(_LINKS, type_, "link: type", partial(driver, setting), _link)
+    return _opened(_LINKS, type_, "link: type", partial(driver, setting), _checked_link)
 
 
-def _sensor_over(type_: str, opened: SensorOver) -> SensorOver:
+def _checked_sensor(type_: str, opened: SensorOver) -> SensorOver:
     if not callable(opened):
-        raise TypeError(
-            "what it opens must be a SensorOver, which makes a sensor of a world's text"
-        )
+        raise TypeError(f"it must open a SensorOver, not a {type(opened).__name__}")
 
     def over(text: str, source: str) -> Sensor | Camera:
         with _as_one_line(_SENSORS, type_, "sensor: type"):
@@ -124,9 +125,9 @@ def _sensor_over(type_: str, opened: SensorOver) -> SensorOver:
     return over
 
 
-def _vehicle(opened: OpenVehicle) -> OpenVehicle:
+def _checked_vehicle(opened: OpenVehicle) -> OpenVehicle:
     if not isinstance(opened, OpenVehicle):
-        raise TypeError(f"what it opens must be an OpenVehicle, not a {type(opened).__name__}")
+        raise TypeError(f"it must open an OpenVehicle, not a {type(opened).__name__}")
     _require(opened.vehicle, "a vehicle", "state", "send", "command")
     _require(
         opened.setup, "a vehicle's setup",
@@ -135,34 +136,28 @@ def _vehicle(opened: OpenVehicle) -> OpenVehicle:
     return opened
 
 
-def _link(opened: Link) -> Link:
+def _checked_link(opened: Link) -> Link:
     _require(opened, "a link", "publish", "is_claimed", "peers", "refused")
     return opened
 
 
+@contextmanager
 def _opened(
     group: str,
     name: str,
     key: str,
     driver: Callable[[], AbstractContextManager[_T]],
     checked: Callable[[_T], _T],
-) -> AbstractContextManager[_T]:
-    with _as_one_line(group, name, key):
-        context = driver()
-
-    @contextmanager
-    def entered() -> Iterator[_T]:
-        with ExitStack() as stack:
-            with _as_one_line(group, name, key):
-                opened = checked(stack.enter_context(context))
-            yield opened
-
-    return entered()
+) -> Iterator[_T]:
+    with ExitStack() as stack:
+        with _as_one_line(group, name, key):
+            opened = checked(stack.enter_context(driver()))
+        yield opened
 
 
 @contextmanager
 def _as_one_line(group: str, name: str, key: str) -> Iterator[None]:
-    """Whatever a package does wrong reaches a person as one line that names it."""
+    """Convert any error of a package to a one-line error that names its type."""
     try:
         yield
     except ValueError:
@@ -184,7 +179,7 @@ def _require(thing: object, what: str, *methods: str) -> None:
 def _load(group: str, name: str, key: str) -> Any:
     entry = _BUILT_IN.get((group, name))
     if entry is None:
-        # Read only if asked for: it takes all packages' metadata.
+        # Slow: this reads the metadata of all installed packages.
         found = entry_points(group=group)
         if name not in found.names:
             built_in = {known for its, known in _BUILT_IN if its == group}
@@ -196,7 +191,7 @@ def _load(group: str, name: str, key: str) -> Any:
         entry = found[name]
     try:
         return entry.load()
-    except Exception as error:  # whatever a package raises while it is imported
+    except Exception as error:  # an import may raise anything
         raise ConfigError(
             f"{key} = {name!r}: {entry.value} cannot be loaded: {type(error).__name__}: {error}"
         ) from error

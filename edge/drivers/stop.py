@@ -1,4 +1,4 @@
-"""Request to end the program, passed from a signal handler to the main thread."""
+"""Stop request from a signal handler to the main thread."""
 
 import os
 import select
@@ -6,27 +6,26 @@ from contextlib import suppress
 
 
 class Stop:
-    """Asked for by a signal handler, or from any thread; awaited by the main thread.
+    """Flag that a signal handler or any thread sets, and that the main thread waits for.
 
-    A `threading.Event` would not do: a handler interrupts the main thread in the midst of its
-    `wait`, whose lock the handler's `set` would then wait for for ever. Here it is a byte in a
-    pipe, which stays for as long as the program runs.
+    A `threading.Event` could deadlock: a handler interrupts the main thread within `wait`, and its
+    `set` waits for the lock that `wait` holds. This flag is a byte in a pipe, never read back.
     """
 
     def __init__(self) -> None:
-        self._asked, self._ask = os.pipe()
-        os.set_blocking(self._ask, False)
+        self._reader, self._writer = os.pipe()
+        os.set_blocking(self._writer, False)
 
     def set(self) -> None:
-        """The program is to end; again is no error."""
+        """Ask the program to end. May be repeated."""
         with suppress(BlockingIOError):
-            os.write(self._ask, b"\0")
+            os.write(self._writer, b"\0")
 
     def is_set(self) -> bool:
-        """Whether it is to end."""
+        """Whether the program must end."""
         return self.wait(0.0)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until it is to end, but no longer than that; whether it is."""
-        asked, _, _ = select.select([self._asked], [], [], timeout_s)
-        return bool(asked)
+        """Wait until the flag is set, for at most `timeout_s`; returns whether it is set."""
+        readable, _, _ = select.select([self._reader], [], [], timeout_s)
+        return bool(readable)

@@ -1,6 +1,6 @@
-"""Talks to systemd, which starts the robot's program, restarts it and shows its state.
+"""Notifications to systemd, which starts and restarts the robot's program and shows its status.
 
-The protocol is sd_notify(3): datagrams of assignments to the socket that $NOTIFY_SOCKET names.
+The protocol is sd_notify(3): datagrams of assignments to the socket named by $NOTIFY_SOCKET.
 """
 
 import json
@@ -18,10 +18,10 @@ _MOST_CHECKS, _MOST_CHARACTERS = 8, 120
 
 
 class ServiceManager:
-    """systemd, or nobody if it did not start this program; then nothing is told to anyone."""
+    """Sender of notifications; does nothing unless systemd started this program."""
 
     def __init__(self) -> None:
-        """Takes the socket's name out of the environment: no child may speak for this program."""
+        """Take the socket's name out of the environment, so that child processes cannot use it."""
         name = os.environ.pop("NOTIFY_SOCKET", "")
         for variable in ("WATCHDOG_USEC", "WATCHDOG_PID"):
             os.environ.pop(variable, None)
@@ -30,11 +30,11 @@ class ServiceManager:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
 
     def close(self) -> None:
-        """Nothing more is told; again is no error."""
+        """Close the socket. May be repeated."""
         self._socket.close()
 
-    def tell(self, *assignments: str) -> None:
-        """Send them, as far as somebody takes them now: never waits, never raises OSError."""
+    def notify(self, *assignments: str) -> None:
+        """Send assignments. Never waits, never raises OSError: an unread one is dropped."""
         if self._address and assignments:
             with suppress(OSError):
                 data = "\n".join(assignments).encode()
@@ -52,9 +52,9 @@ def status_text(
 ) -> str:
     """`STATUS=` and one JSON object: ASCII, below 3,000 characters, since systemd takes 4 kB.
 
-    `monotonic_s` tells readers how old it is. `autopilot`: its telemetry is fresh. `ages_s`: since
-    each loop's last tick that succeeded. `peers`: zenoh sessions connected to this one.
-    `insecure`: whoever is on the network can fly it.
+    `monotonic_s` lets readers compute the status's age. `autopilot`: its telemetry is fresh.
+    `ages_s`: time since each loop's last successful tick; None before the first. `peers`: number of
+    connected zenoh sessions. `insecure`: anyone on the network can fly the robot.
     """
     text = {
         "monotonic_s": round(monotonic_s, 3),
@@ -77,7 +77,7 @@ def status_text(
         },
         "peers": peers,
         "insecure": insecure,
-        # It is opened before the loops start, and closed after they ended.
+        # The link is open from before the loops start until after they end.
         "link": True,
         "bundle_id": status.bundle_id,
         "world_id": status.world_id,
@@ -102,5 +102,5 @@ def _rounded(value: float | None) -> float | None:
 
 
 def _short(text: str) -> str:
-    """In characters that JSON needs no long escapes for."""
+    """Shorten `text`, and replace characters that JSON would escape at length."""
     return re.sub(r"[^ -~]", "?", text)[:_MOST_CHARACTERS]

@@ -1,4 +1,4 @@
-"""A sensor that reads a known world: for flights over a virtual importance density function."""
+"""Simulated sensor over a known world, for flights over a virtual importance density function."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ from edge.core.world import MOST_FEATURES, parse_world, rasterize
 
 
 class WorldSensor:
-    """Shows the part of the world's raster that a downward camera at the position would see."""
+    """Sensor that reads the world's raster as a downward camera would see it."""
 
     def __init__(self, importance: F32, sensor_size: int) -> None:
         """`importance` is (world_size, world_size), indexed [x, y]."""
@@ -22,7 +22,7 @@ class WorldSensor:
         self._size = sensor_size
 
     def view(self, position: F64) -> F32:
-        """(sensor_size, sensor_size) around `position` (2,), model units; 0 outside the world."""
+        """View (sensor_size, sensor_size) around `position` (2,), model units; 0 off the world."""
         view = np.zeros((self._size, self._size), np.float32)
         corner = window_corner(position, self._size)
         in_world, in_view = part_in_world(corner, self._size, len(self._importance))
@@ -32,13 +32,13 @@ class WorldSensor:
 
 @contextmanager
 def world_sensor(setting: SensorSetting) -> Iterator[SensorOver]:
-    """The type "world" of robot.toml's [sensor]; it has no options. Raises ConfigError."""
+    """Open the sensor of `type = "world"` in [sensor]; it has no options. Raises ConfigError."""
     no_options("sensor", setting.options)
     yield partial(_sensor_over, setting)
 
 
 def _sensor_over(setting: SensorSetting, text: str, source: str) -> WorldSensor:
-    """A sensor over a world file's text. Raises ValueError, one line with `source`."""
+    """Make a sensor from a world file's text. Raises ValueError, one line with `source`."""
     perception = setting.perception
     features = parse_world(text, source)
     if len(features) > MOST_FEATURES:

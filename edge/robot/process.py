@@ -149,13 +149,13 @@ def run(config: RobotConfig, stop: Stop) -> None:
         libc.malloc_trim(0)  # What verification took goes back to the system.
         program.start()
         parts.callback(program.leave)
-        parts.callback(service_manager.tell, STOPPING)
+        parts.callback(service_manager.notify, STOPPING)
         if config.link.insecure:
             log.warning("insecure: whoever is on the network can fly this robot")
         log.info("robot runs", robot=config.robot_id, bundle=bundle_id[:12])
         # 8. Until somebody stops the program.
         while not stop.wait(_PERIOD_S):  # A signal that another thread took is seen only here.
-            service_manager.tell(*program.news())
+            service_manager.notify(*program.news())
 
 
 def _open_vehicle(config: RobotConfig) -> AbstractContextManager[OpenVehicle]:

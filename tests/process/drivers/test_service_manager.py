@@ -38,8 +38,8 @@ def test_assignments_arrive_and_no_child_inherits_the_socket(
         monkeypatch.setenv(variable, value)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd, service_manager() as manager:
         systemd.bind(name.replace("@", "\0"))
-        manager.tell()
-        manager.tell("STATUS=well", "WATCHDOG=1")
+        manager.notify()
+        manager.notify("STATUS=well", "WATCHDOG=1")
         assert systemd.recv(4096) == b"STATUS=well\nWATCHDOG=1"
         assert not {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"} & os.environ.keys()
 
@@ -48,16 +48,16 @@ def test_nobody_who_listens_or_reads_is_no_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with service_manager() as alone:
-        alone.tell("READY=1")
+        alone.notify("READY=1")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     with service_manager() as manager:
-        manager.tell("READY=1")
+        manager.notify("READY=1")
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
             systemd.bind(str(tmp_path / "notify"))
             # It hangs: its queue fills up, and nobody waits for it.
             for _ in range(10_000):
-                manager.tell("WATCHDOG=1")
-        manager.tell("STOPPING=1")
+                manager.notify("WATCHDOG=1")
+        manager.notify("STOPPING=1")
 
 
 def test_a_status_is_one_line_of_ascii_however_long_its_texts_are() -> None:
