@@ -15,7 +15,7 @@ import zenoh
 
 from bench import BUNDLE
 from bench.result import Result, Table, Target, progress
-from edge.drivers.identity_folder import listening_identity
+from edge.drivers.identity_folder import receiving_identity
 from edge.messages.topics import TlsFiles
 from lpac.sim.engines import require_flown
 from lpac.sim.fleet.flight import FleetMoment, fly_programs
@@ -95,7 +95,7 @@ def _flood(
     sent: "Synchronized[int]",
 ) -> None:
     """Publish `RATE_HZ` messages a second until `over`, with the keys in that folder, if any."""
-    tls = None if keys is None else certified(listening_identity(keys, fleet=fleet).tls)
+    tls = None if keys is None else certified(receiving_identity(keys, fleet=fleet).tls)
     names = itertools.cycle(_OUTSIDERS if keys is None else _MEMBERS)
     began_s, count = time.monotonic(), 0
     with unruly_session(endpoints, tls) as session:

@@ -1,14 +1,15 @@
-"""Guard of the radio's TCP port: members get in, strangers seldom, and in a flood not at all.
+"""Port knocking for the radio's TCP port, so that a flood of connections cannot keep members out.
 
 zenoh's acceptor pauses for 100 ms after each connection that fails its TLS handshake, and keeps
-those that never finish it: twenty a second from anybody on the network would keep all members out.
-The kernel's socket filter (classic BPF, in every kernel, needs no privilege) drops a stranger's SYN
-before anything comes of it. It belongs to the listening socket alone: it ends with the program, and
-touches no other port.
+those that never finish it. Twenty connections a second from anyone on the network would therefore
+keep all members out. A `Door` attaches a socket filter (classic BPF, in every kernel, without
+privileges) to the listening socket, which drops a stranger's SYN in the kernel. The filter affects
+no other port, and ends with the program.
 
-A member is known by its address, once it has knocked: it sends a signed datagram to the UDP port of
-the same number (`knock`, until it is connected), as does everybody who is connected. Of strangers'
-connections one in sixteen gets in, for members that cannot knock, unless too many come.
+The filter admits addresses. To knock, a member sends a signed datagram to the UDP port of the same
+number, again and again until it is connected. Its address is then known, as are those of all
+connected peers. One in sixteen connections from unknown addresses passes, too, for members that
+cannot knock; none does during a flood.
 """
 
 import array
@@ -32,48 +33,49 @@ from edge.messages.topics import Knocking
 
 Address = ipaddress.IPv4Address
 
-# So many refused within a second are a flood; one member that cannot knock calls twice.
-_MANY, _WITHIN_S = 8, 1.0
-# After a start all others call at once, and are strangers until they have knocked: fifty of them,
-# twice a second each, are fewer than that.
-_SETTLES_S, _MOST_AT_START = 2.0, 200
-# It is over once so few came for so long.
-_FEW, _CALM_S = 30, 10.0
-_ONE_IN = 16
-_LOOKS_S, _LEARNS_S = 0.05, 1.0
-# Of those who knock, a second; whoever floods that as well delays only who is not known yet.
+# A flood begins with this many refused connections within the window. A single member that cannot
+# knock is refused about twice a second.
+_FLOOD_REFUSED, _FLOOD_WINDOW_S = 8, 1.0
+# After a start, all others connect at once and are unknown until they have knocked. Fifty robots
+# at two attempts a second stay below this number.
+_SETTLE_S, _MOST_AT_START = 2.0, 200
+# A flood ends with fewer than this many refused connections within the time.
+_CALM_REFUSED, _CALM_S = 30, 10.0
+_ADMIT_ONE_IN = 16
+_UPDATE_PERIOD_S, _PEERS_PERIOD_S = 0.05, 1.0
+# A flood of knocks delays only members whose addresses are not known yet.
 _MOST_KNOCKS_HZ = 400.0
 _KNOCK_BYTES = 2048
 _MOST_USED = 0.8
-# The filter jumps to its end from each address, by 8 bits.
+# The filter jumps from each address to its end, by at most 255 instructions.
 _MOST_ADDRESSES = 240
 
 _SO_ATTACH_FILTER, _SO_DETACH_FILTER, _SO_MEMINFO = 26, 27, 55
-_DROPS = 8  # of SO_MEMINFO's numbers
-_PKTINFO, _PKTINFO_BYTES = 8, 12  # IP_PKTINFO, which ends with the address that a datagram was for
-_BACKLOG, _MOST_BACKLOG = 6, 7  # of TCP_INFO's 32-bit words, for a socket that listens
-_SOURCE = 0xFFF00000 + 12  # SKF_NET_OFF; behind it, the source address of IPv4
+_DROPS = 8  # index in SO_MEMINFO
+_PKTINFO, _PKTINFO_BYTES = 8, 12  # IP_PKTINFO; its last 4 bytes are the destination address
+_BACKLOG, _MOST_BACKLOG = 6, 7  # indices of TCP_INFO's 32-bit words, for a listening socket
+_SOURCE = 0xFFF00000 + 12  # SKF_NET_OFF + offset of the IPv4 source address
 _RANDOM = 0xFFFFF000 + 56  # SKF_AD_OFF + SKF_AD_RANDOM
-_FLAGS, _SYN, _ACK = 13, 0x02, 0x10  # of the TCP header, at which a socket's filter begins
+_FLAGS, _SYN, _ACK = 13, 0x02, 0x10  # in the TCP header, where a socket filter's data begins
 _LOAD, _LOAD_BYTE, _AND, _EQUAL, _RETURN = 0x20, 0x30, 0x54, 0x15, 0x06
 
 
 def allow_most_descriptors() -> None:
-    """Let this program open as many files and connections as the system lets it."""
+    """Raise this process's limit of open files and connections to the system's."""
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with contextlib.suppress(OSError, ValueError):  # In a sandbox, where its unit says how many.
+    with contextlib.suppress(OSError, ValueError):  # in a sandbox, where the unit sets the limit
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def descriptors_short() -> str:
-    """Warning that nearly all file descriptors of this process are in use; "" if not."""
+    """Warning if more than 80 % of this process's file descriptors are in use, else ""."""
     used = sum(1 for _ in Path("/proc/self/fd").iterdir())
     most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return f"{used} of {most} descriptors are in use" if used > _MOST_USED * most else ""
 
 
 class DoorStatus(NamedTuple):
-    """Whether it is flooded, how many connections it has refused, whether its queue is full."""
+    """State of a port; `refused` counts connections, `queue_full` is its queue of new ones."""
 
     flooded: bool
     refused: int
@@ -81,39 +83,39 @@ class DoorStatus(NamedTuple):
 
 
 class Flood:
-    """Whether strangers flood a port that is open since `began_s`, by how many were refused."""
+    """Detects a flood by the number of refused connections."""
 
     def __init__(self, began_s: float) -> None:
-        """Times are a monotonic clock's."""
-        self._settled_s = began_s + _SETTLES_S
+        """`began_s` is when the port was opened; times are by a monotonic clock."""
+        self._settled_s = began_s + _SETTLE_S
         self._recent: deque[tuple[float, int]] = deque()
         self._flooded = False
 
-    def look(self, now_s: float, refused: int) -> bool:
-        """So many were refused until now: whether it is flooded."""
+    def update(self, now_s: float, refused: int) -> bool:
+        """Add the total number of refused connections; returns whether there is a flood."""
         recent = self._recent
         recent.append((now_s, refused))
         while now_s - recent[0][0] > _CALM_S:
             recent.popleft()
-        since_s = max(now_s - _WITHIN_S, self._settled_s)
+        since_s = max(now_s - _FLOOD_WINDOW_S, self._settled_s)
         lately = refused - next((count for at_s, count in recent if at_s >= since_s), refused)
-        is_long = now_s - recent[0][0] > _CALM_S - _WITHIN_S
-        is_over = is_long and refused - recent[0][1] < _FEW
-        begins = lately >= _MANY or (now_s < self._settled_s and refused >= _MOST_AT_START)
+        is_long = now_s - recent[0][0] > _CALM_S - _FLOOD_WINDOW_S
+        is_over = is_long and refused - recent[0][1] < _CALM_REFUSED
+        begins = lately >= _FLOOD_REFUSED or (now_s < self._settled_s and refused >= _MOST_AT_START)
         self._flooded = begins or (self._flooded and not is_over)
         return self._flooded
 
 
 class Door:
-    """Watches a socket of this process that listens, in a thread of its own."""
+    """Filters the connections to a listening socket of this process, in a thread of its own."""
 
     def __init__(
-        self, listening: socket.socket, members: Knocking, met: Callable[[], Iterable[str]]
+        self, listening: socket.socket, members: Knocking, peers: Callable[[], Iterable[str]]
     ) -> None:
-        """Whoever knocks as one of `members` gets in, and whoever is among `met`.
+        """Admit the addresses of members that knock, and those of connected `peers`.
 
-        It closes `listening`, which is a descriptor of its own. Raises OSError if the UDP port of
-        that number is taken, or the kernel has no such filter.
+        `listening` is a descriptor of its own, which the door closes. Raises OSError if the UDP
+        port of the same number is taken, or if the kernel refuses the filter.
         """
         self._listening = listening
         listening.setblocking(False)
@@ -122,8 +124,8 @@ class Door:
         self._knocks.bind(listening.getsockname())
         self._knocks.setblocking(False)
         self._members = members
-        self._met = met
-        # The last that was heard of is the last.
+        self._peers = peers
+        # The address seen last is the last key.
         self._known: dict[Address, None] = {}
         self._status = DoorStatus(flooded=False, refused=0, queue_full=False)
         try:
@@ -138,13 +140,13 @@ class Door:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop updating the filter, and end the thread."""
         self._end.set()
         self._thread.join(1.0)
 
     @property
     def status(self) -> DoorStatus:
-        """From any thread."""
+        """State of the port. Thread-safe."""
         return self._status
 
     def _run(self) -> None:
@@ -154,7 +156,7 @@ class Door:
                     self._attach()
                     self._watch()
                 except Exception as error:
-                    # Unwatched, it would learn of no member any more: better open to all.
+                    # Without updates, the filter would keep new members out: open the port to all.
                     with contextlib.suppress(OSError):
                         self._listening.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
                     with contextlib.suppress(Exception):
@@ -162,58 +164,57 @@ class Door:
                     self._end.wait(_CALM_S)
 
     def _watch(self) -> None:
-        learns_s, looks_s, allowed = 0.0, 0.0, _MOST_KNOCKS_HZ
-        counted_s = time.monotonic()
+        peers_due_s, update_due_s, allowed = 0.0, 0.0, _MOST_KNOCKS_HZ
+        allowed_at_s = time.monotonic()
         poll = select.poll()
         poll.register(self._knocks, select.POLLIN)
         while not self._end.is_set():
             if allowed < 1.0:
-                # Those beyond the rate stay in the kernel's buffer, which drops what it cannot
-                # hold at no cost here.
-                self._end.wait(_LOOKS_S)
-            knocks = bool(poll.poll(1e3 * _LOOKS_S))
+                # Knocks above the rate wait in the kernel's buffer, which drops the excess without
+                # cost to this process.
+                self._end.wait(_UPDATE_PERIOD_S)
+            knocks = bool(poll.poll(1e3 * _UPDATE_PERIOD_S))
             now_s = time.monotonic()
-            allowed = min(allowed + _MOST_KNOCKS_HZ * (now_s - counted_s), _MOST_KNOCKS_HZ)
-            counted_s = now_s
+            allowed = min(allowed + _MOST_KNOCKS_HZ * (now_s - allowed_at_s), _MOST_KNOCKS_HZ)
+            allowed_at_s = now_s
             if knocks:
                 with contextlib.suppress(BlockingIOError):
-                    data, place, address = self._next_knock()
+                    data, place, address = self._receive_knock()
                     allowed -= 1.0
                     if self._members.is_knock(data, place):
-                        self._let_in([address])
-            if now_s >= learns_s:
-                learns_s = now_s + _LEARNS_S
-                self._let_in(self._met())
-            if now_s < looks_s:
-                continue
-            looks_s = now_s + _LOOKS_S
-            self._look(now_s)
+                        self._admit([address])
+            if now_s >= peers_due_s:
+                peers_due_s = now_s + _PEERS_PERIOD_S
+                self._admit(self._peers())
+            if now_s >= update_due_s:
+                update_due_s = now_s + _UPDATE_PERIOD_S
+                self._update(now_s)
 
-    def _next_knock(self) -> tuple[bytes, str, str]:
-        """Receive a knock: its data, its destination's address:port, and its sender's address."""
+    def _receive_knock(self) -> tuple[bytes, str, str]:
+        """Receive a knock: its data, its destination as address:port, its sender's address."""
         data, [(_, _, info)], _, (address, _) = self._knocks.recvmsg(
             _KNOCK_BYTES, socket.CMSG_SPACE(_PKTINFO_BYTES)
         )
         to = socket.inet_ntoa(info[_PKTINFO_BYTES - 4 : _PKTINFO_BYTES])
         return data, f"{to}:{self._knocks.getsockname()[1]}", address
 
-    def _look(self, now_s: float) -> None:
+    def _update(self, now_s: float) -> None:
         was, refused = self._status.flooded, _drops(self._listening) - self._drops_before
-        flooded = self._flood.look(now_s, refused)
+        flooded = self._flood.update(now_s, refused)
         self._status = DoorStatus(flooded, refused, _queue_is_full(self._listening))
         if flooded == was:
             return
         self._attach()
         if flooded:
-            log.warning("strangers flood the radio's port: members alone get in")
-            # Those that wait are strangers', nearly all; a member among them calls again at once.
+            log.warning("a flood of connections to the radio's port: only members are admitted")
+            # Drop the queue: nearly all of it is the flood's, and a member connects again at once.
             with contextlib.suppress(OSError):
                 while not self._end.is_set():
                     self._listening.accept()[0].close()
         else:
-            log.warning("strangers flood the radio's port no more", refused=refused)
+            log.warning("the flood of connections has ended", refused=refused)
 
-    def _let_in(self, addresses: Iterable[str]) -> None:
+    def _admit(self, addresses: Iterable[str]) -> None:
         new = False
         for address in map(Address, addresses):
             new |= address not in self._known
@@ -225,10 +226,10 @@ class Door:
             self._attach()
 
     def _attach(self) -> None:
-        """Let a SYN pass from who is known and from this computer, and of others now and then."""
+        """Attach the filter: admit SYNs of known addresses and of this computer, few of others."""
         known = list(self._known)
         code = [
-            # What is no first SYN passes, also to the connections, which inherit this.
+            # Accepted connections inherit the filter: it passes all but the first SYN.
             (_LOAD_BYTE, 0, 0, _FLAGS),
             (_AND, 0, 0, _SYN | _ACK),
             (_EQUAL, 0, len(known) + 6, _SYN),
@@ -239,9 +240,9 @@ class Door:
             (_AND, 0, 0, 0xFF000000),
             (_EQUAL, 3, 0, 127 << 24),
             (_LOAD, 0, 0, _RANDOM),
-            (_AND, 0, 0, _ONE_IN - 1),
-            # Never, if flooded: it is less than that.
-            (_EQUAL, 0, 1, _ONE_IN if self._status.flooded else 0),
+            (_AND, 0, 0, _ADMIT_ONE_IN - 1),
+            # In a flood never equal, since the number is smaller.
+            (_EQUAL, 0, 1, _ADMIT_ONE_IN if self._status.flooded else 0),
             (_RETURN, 0, 0, 0xFFFFFFFF),
             (_RETURN, 0, 0, 0),
         ]
@@ -250,8 +251,8 @@ class Door:
         self._listening.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
 
 
-def listening() -> dict[int, socket.socket]:
-    """This process's IPv4 TCP sockets that listen, in descriptors of their own, by inode."""
+def listening_sockets() -> dict[int, socket.socket]:
+    """This process's listening IPv4 TCP sockets by inode, each as a new descriptor."""
     found = {}
     for entry in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
@@ -267,11 +268,11 @@ def listening() -> dict[int, socket.socket]:
     return found
 
 
-def _drops(listens: socket.socket) -> int:
-    numbers = array.array("I", listens.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
+def _drops(listening: socket.socket) -> int:
+    numbers = array.array("I", listening.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
     return numbers[_DROPS]
 
 
-def _queue_is_full(listens: socket.socket) -> bool:
-    words = array.array("I", listens.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 32))
+def _queue_is_full(listening: socket.socket) -> bool:
+    words = array.array("I", listening.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 32))
     return words[_BACKLOG] >= words[_MOST_BACKLOG]

@@ -1,14 +1,13 @@
-"""A member's identity on its disk: what `lpac fleet` put there, and a secret key that never leaves.
+"""A member's identity on its disk, written by `lpac fleet`; the secret key never leaves it.
 
-| file | what |
+| file | content |
 | --- | --- |
 | `members` | the fleet's list of members: see `edge.identity.members` |
-| `key.pem` | the secret key, PKCS #8; for nobody else to read |
-| `certificate.pem`, `authority.pem` | for TLS: of the same key, and of the authority |
-| `start` | the number of this start of the program, greater than those before |
-| `room` | nothing: kept for the files above, should the disk be full |
-| `group-keys` | of a robot: the fleet's keys of its multicast group, in hexadecimal digits, a line
-each, the newest first; for nobody else to read |
+| `key.pem` | the secret key, PKCS #8, mode 600 |
+| `certificate.pem`, `authority.pem` | TLS certificates of this key and of the fleet's authority |
+| `start` | number of the program's last start, increasing |
+| `room` | zeros: space reserved for the files above on a full disk |
+| `group-keys` | robots only: the multicast group's keys in hexadecimal, newest first, mode 600 |
 """
 
 import base64
@@ -42,100 +41,101 @@ GROUP_KEYS = "group-keys"
 
 @dataclass(slots=True)
 class Identity:
-    """One start of a member's program; `start_is_kept` says whether the disk has its number.
+    """One start of a member's program; `start_saved`: its number is on the disk.
 
-    `group_keys` are None for a member that was given none, which is not in the group.
+    `group_keys` is None for a member that is not in the multicast group.
     """
 
     folder: Path
     membership: Membership
     tls: TlsFiles
     group_keys: GroupKeys | None
-    start_is_kept: bool = True
-    _given_keys: tuple[bytes, ...] = ()
+    start_saved: bool = True
+    _file_keys: tuple[bytes, ...] = ()
     _stamps: tuple[object, ...] = ()
-    _problems: set[str] = field(default_factory=set)
+    _logged: set[str] = field(default_factory=set)
 
     def guard(self, clock_s: Callable[[], float]) -> SignedGuard:
-        """The guard that the program speaks and hears through; `clock_s` is its monotonic clock."""
+        """The program's guard, which signs and verifies; `clock_s` is a monotonic clock."""
         return SignedGuard(self.membership, clock_s)
 
-    def take_up(self, guard: SignedGuard, *, in_flight: bool = False) -> None:
-        """Follow the list of members and the group's keys on the disk; then write the start.
+    def update(self, guard: SignedGuard, *, in_flight: bool = False) -> None:
+        """Apply changes of the members and the group's keys on the disk; then save the start.
 
-        Files that cannot be used change nothing, and are reported once. In flight the spoken key of
-        the group stays, and all keys that are heard: others may not have been given the newest.
+        An unusable file changes nothing and is logged once. In flight the group's sending key does
+        not change and no key is dropped, since others may not have the newest yet.
 
-        Raises OSError that names the file, if the start cannot be written.
+        Raises OSError that names the file, if the start cannot be saved.
         """
         stamps = tuple(_stamp(self.folder / name) for name in (MEMBERS, GROUP_KEYS))
         if stamps != self._stamps:
             self._stamps = stamps
-            self._take(lambda: guard.update_members(read_members(self.folder)))
-            self._take(self._take_keys)
-        if self.group_keys is not None and self._given_keys:
-            self.group_keys = _followed(self.group_keys, self._given_keys, in_flight=in_flight)
-        if not self.start_is_kept:
-            _keep_start(self)
+            self._read(lambda: guard.update_members(read_members(self.folder)))
+            self._read(self._read_keys)
+        if self.group_keys is not None and self._file_keys:
+            self.group_keys = _updated(self.group_keys, self._file_keys, in_flight=in_flight)
+        if not self.start_saved:
+            _save_start(self)
 
-    def _take_keys(self) -> None:
-        self._given_keys = read_group_keys(self.folder / GROUP_KEYS)
+    def _read_keys(self) -> None:
+        self._file_keys = read_group_keys(self.folder / GROUP_KEYS)
 
-    def _take(self, take: Callable[[], None]) -> None:
+    def _read(self, read: Callable[[], None]) -> None:
         try:
-            take()
+            read()
         except (ValueError, OSError) as error:
             if isinstance(error, OSError):
-                self._stamps = ()  # The next attempt may succeed.
-            if str(error) not in self._problems:
-                self._problems.add(str(error))
-                log.warning("list of members not taken up", why=str(error))
+                self._stamps = ()  # try again next time
+            if str(error) not in self._logged:
+                self._logged.add(str(error))
+                log.warning("identity not updated", why=str(error))
 
 
-def _followed(now: GroupKeys, given: tuple[bytes, ...], *, in_flight: bool) -> GroupKeys:
+def _updated(now: GroupKeys, new: tuple[bytes, ...], *, in_flight: bool) -> GroupKeys:
     if not in_flight:
-        return now if now.receiving == given else GroupKeys(given, given[0])
-    older = tuple(key for key in now.receiving if key not in given)
-    return now if now.receiving == given + older else GroupKeys(given + older, now.sending)
+        return now if now.receiving == new else GroupKeys(new, new[0])
+    older = tuple(key for key in now.receiving if key not in new)
+    return now if now.receiving == new + older else GroupKeys(new + older, now.sending)
 
 
 def load_identity(
     folder: Path, *, fleet: str, unix_s: float, robot_id: int | None = None
 ) -> Identity:
-    """The identity in the folder, for a new start of the program.
+    """Load the identity in the folder for a new start of the program.
 
-    Starts are numbered by the wall clock, ms, or by one more than the last where that is behind:
-    a computer whose clock was lost is heard all the same. A number that cannot be written is no
-    obstacle: `Identity.take_up` says so, and tries again. With `robot_id` it must be that robot's;
-    one that is not in the list of members starts all the same, as it may be in the air.
+    A start's number is the wall clock, ms, or the last number plus one if the clock is behind it:
+    others accept messages only from increasing starts. `lpac fleet up` resets a number that a wrong
+    clock left far in the future. If the number cannot be saved, the start
+    goes on, and `Identity.update` tries again and raises the error. With `robot_id` the identity
+    must be that robot's. A robot that is not in the list of members starts, too: it may be in the
+    air.
 
-    Raises ConfigError, in one line, for what cannot be used; OSError.
+    Raises ConfigError, one line, if the folder's content cannot be used; OSError.
     """
     last, unix_ms = _last_start(folder / _START), int(unix_s * 1e3)
     identity = _load(folder, fleet, max(last + 1, unix_ms), robot_id)
     try:
-        _keep_start(identity)
+        _save_start(identity)
     except OSError:
         if unix_ms <= last:
-            # The next start would have the same number; this grows until the computer restarts.
+            # The next start would get the same number. The uptime makes it differ.
             start = last + 1 + time.monotonic_ns() // 10**6 % _DAY_MS
             identity = _load(folder, fleet, start, robot_id)
-        identity.start_is_kept = False
+        identity.start_saved = False
     return identity
 
 
-def _keep_start(identity: Identity) -> None:
-    """Write its number, once: `lpac fleet up` resets one that a wrong clock made too great."""
+def _save_start(identity: Identity) -> None:
     path, start = identity.folder / _START, identity.membership.start
     if _last_start(path) < start:
         _write(path, f"{start}\n".encode())
-    identity.start_is_kept = True
+    identity.start_saved = True
 
 
-def listening_identity(folder: Path, *, fleet: str, robot_id: int | None = None) -> Identity:
-    """The same for a program that says nothing: it is no new start, and nothing is written.
+def receiving_identity(folder: Path, *, fleet: str, robot_id: int | None = None) -> Identity:
+    """Load the identity for a program that only receives: no new start, nothing is written.
 
-    Raises as above.
+    Raises as `load_identity`.
     """
     return _load(folder, fleet, 0, robot_id)
 
@@ -153,7 +153,7 @@ def _load(folder: Path, fleet: str, start: int, robot_id: int | None) -> Identit
     except ValueError as error:
         raise ConfigError(f"{folder}: {error}") from None
     if members.fleet != fleet:
-        raise ConfigError(f"{folder}: is of fleet {members.fleet!r}, not of {fleet!r}")
+        raise ConfigError(f"{folder}: belongs to fleet {members.fleet!r}, not {fleet!r}")
     own = members.by_key.get(signer.fingerprint)
     if own is None and robot_id is None:
         raise ConfigError(
@@ -163,20 +163,20 @@ def _load(folder: Path, fleet: str, start: int, robot_id: int | None) -> Identit
     if own is None:
         own = Member(Role.ROBOT, f"robot-{robot_id}", robot_id, signer.public_key)
     if robot_id not in (None, own.robot_id):
-        raise ConfigError(f"{folder}: is {own.role} {own.name}'s, not robot {robot_id}'s")
+        raise ConfigError(f"{folder}: belongs to {own.role} {own.name}, not robot {robot_id}")
     paths = (str(folder / name) for name in (AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM))
     group_keys = GroupKeys(keys, keys[0]) if keys else None
     membership = Membership(own, signer, members, start)
-    return Identity(folder, membership, TlsFiles(*paths), group_keys, _given_keys=keys)
+    return Identity(folder, membership, TlsFiles(*paths), group_keys, _file_keys=keys)
 
 
 def read_members(folder: Path) -> Members:
-    """The list of members in the folder. Raises MembersError, OSError."""
+    """Read the list of members. Raises MembersError, OSError."""
     return parse_members(_bytes_of(folder / MEMBERS).decode("utf-8", "replace"))
 
 
 def _stamp(path: Path) -> tuple[int, ...] | None:
-    """Whatever changes with a file's content, as it is never written in place."""
+    """Values that change with the file's content; files are replaced, never written in place."""
     try:
         status = path.stat()
     except OSError:
@@ -185,12 +185,12 @@ def _stamp(path: Path) -> tuple[int, ...] | None:
 
 
 def group_keys_text(keys: Sequence[bytes]) -> bytes:
-    """The file of a robot's keys of the group, the newest first."""
+    """Content of the file of the group's keys, newest first."""
     return "".join(f"{key.hex()}\n" for key in keys).encode()
 
 
 def read_group_keys(path: Path) -> tuple[bytes, ...]:
-    """The keys in the file, none if there is no file. Raises ValueError, OSError."""
+    """Read the group's keys; none if there is no file. Raises ValueError, OSError."""
     try:
         _require_private(path)
         keys = tuple(map(bytes.fromhex, _bytes_of(path).decode("ascii", "replace").split()))
@@ -203,7 +203,7 @@ def read_group_keys(path: Path) -> tuple[bytes, ...]:
 
 def _require_private(path: Path) -> None:
     if path.stat().st_mode & 0o077:
-        raise ValueError(f"{path.name} is readable for others: chmod 600 {path}")
+        raise ValueError(f"{path.name} is readable by others: chmod 600 {path}")
 
 
 def _seed(path: Path) -> bytes:
@@ -214,14 +214,14 @@ def _seed(path: Path) -> bytes:
     )
     der = base64.b64decode(match[1]) if match else b""
     if len(der) != len(_PKCS8_HEAD) + SEED_BYTES or not der.startswith(_PKCS8_HEAD):
-        raise ValueError(f"{path.name}: is no Ed25519 key (PKCS #8, PEM)")
+        raise ValueError(f"{path.name}: is not an Ed25519 key (PKCS #8, PEM)")
     return der[len(_PKCS8_HEAD) :]
 
 
 def _last_start(path: Path) -> int:
     try:
         return min(max(int(_bytes_of(path)), 0), 2**47)
-    except (FileNotFoundError, ValueError):  # The first one, or its disk was full.
+    except (FileNotFoundError, ValueError):  # the first start, or the disk was full
         return 0
 
 

@@ -1,9 +1,8 @@
-"""Multicast: datagrams by which a robot tells something to all others at once.
+"""Multicast link: robots exchange their messages in a multicast group, all else goes over zenoh.
 
-On Wi-Fi the access point sends such a frame once, at its slow basic rate and without an
-acknowledgement: some are lost, which the policy takes, and ten times as many robots fit into a
-channel. Everything else goes over zenoh, to and from the grounds, each of which is connected to all
-robots.
+On Wi-Fi the access point sends a multicast frame once, at its slow basic rate and without
+acknowledgement. Some frames are lost, which the policy tolerates, and ten times as many robots fit
+into a channel. The zenoh connections are those between each ground and each robot.
 """
 
 import math
@@ -30,28 +29,29 @@ from edge.identity.replay_window import NO_NUMBER
 from edge.messages.admission import Admission
 from edge.messages.topics import MESSAGE, Group, GroupKeys, ReceiveCallback, Topic
 
-# Of a hundred robots' messages those of a second, where the kernel allows as much (rmem_max).
+# One second of messages of a hundred robots, if the kernel allows it (rmem_max).
 _BUFFER_BYTES = 2**19
-# How soon it looks whether it is to end; and tries again to join, where there is no network yet.
-_WAKES_S, _JOINS_AGAIN_S = 0.25, 0.5
-_FORGETS_AFTER_S = 5.0
-# An interface that went, or an access point that forgot who listens, takes a membership away. What
-# this robot says itself comes back all the same, and is no sign of one.
-_REJOINS_AFTER_S = 5.0
+_RECEIVE_TIMEOUT_S, _JOIN_RETRY_S = 0.25, 0.5
+# Without keys, a sender silent for this long may have restarted with an earlier clock.
+_FORGET_SENDER_S = 5.0
+# A membership ends unnoticed when the interface goes down or the access point forgets it. The
+# robot's own datagrams still loop back then.
+_REJOIN_AFTER_S = 5.0
 _CLOSE_TIMEOUT_S = 1.0
 _CLAIMED_FOR_S = 3.0
-# A thread that wakes for each datagram finds its caches cold: where more than so many come in a
-# second, as of thirty robots, it takes those of such a time together. Where far more come, somebody
-# floods the group, and no buffer holds that for as long.
-_MANY_HZ, _FLOOD_HZ, _COUNTS_FOR_S, _TOGETHER_S = 100.0, 1000.0, 1.0, 0.1
-# By the present and by the former key: whoever claims them all takes no other's place.
-_MOST_PLACES = 2 * (MAX_CERTIFIED_ID + 1)
+# A thread that wakes for each datagram runs with cold caches. At a rate above _BATCH_HZ, as of
+# thirty robots, it reads the datagrams of _BATCH_S together. Above _FLOOD_HZ it does not wait,
+# since the buffer would overflow.
+_BATCH_HZ, _FLOOD_HZ, _RATE_WINDOW_S, _BATCH_S = 100.0, 1000.0, 1.0, 0.1
+# One budget for each robot id and each of two keys, so that a member that claims all ids takes no
+# other's budget.
+_MOST_BUDGETS = 2 * (MAX_CERTIFIED_ID + 1)
 
 
 class MulticastLink:
-    """A robot's radio: a group for what robots tell each other, and zenoh for the rest.
+    """A robot's radio: a multicast group for robots' messages, and zenoh for all other topics.
 
-    Every method may be called from any thread. Close it, or use it as a context manager.
+    Thread-safe. Close it, or use it as a context manager.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class MulticastLink:
         on_message: ReceiveCallback | None,
         zenoh: ZenohLink,
     ) -> None:
-        """Join the group, and stay in it; without a network it joins once there is one.
+        """Join the group and stay in it; without a network, join once there is one.
 
-        `on_message` is told the others' messages; `zenoh` is closed with it. What this link says
-        does not come back; with `robot_id` None it only listens.
+        `on_message` gets the others' messages, never this link's own. With `robot_id` None the link
+        only receives. Closing it closes `zenoh`, too.
         """
         self._group = group
         self._robot_id = robot_id
@@ -73,18 +73,17 @@ class MulticastLink:
         self._on_message = on_message
         self._known: GroupKeys | None = None
         self._keys: tuple[GroupKey, ...] = ()
-        self._own_start = -1  # Of this program, once it has spoken.
-        self._said_as_this_one_s = -math.inf
-        # No robot with a certificate has a greater one.
+        self._own_start = -1  # this program's, from its first message on
+        self._claimed_at_s = -math.inf
         self._greatest_id = MAX_CERTIFIED_ID if group.is_secret else MAX_ROBOT_ID
-        self._admission = Admission(_MOST_PLACES)
+        self._admission = Admission(_MOST_BUDGETS)
         self._lock = Lock()
-        self._problems: Counter[str] = Counter()
+        self._failures: Counter[str] = Counter()
         self._strangers = 0
-        self._sender = _sending()
+        self._sender = _sender()
         self._closed = Event()
-        self._hearing = Thread(target=self._hear, name="multicast", daemon=True)
-        self._hearing.start()
+        self._receiving = Thread(target=self._receive_until_closed, name="multicast", daemon=True)
+        self._receiving.start()
 
     def __enter__(self) -> Self:
         return self
@@ -93,112 +92,109 @@ class MulticastLink:
         self.close()
 
     def publish(self, topic: Topic, data: bytes) -> None:
-        """Send to whoever listens; it may be lost. Raises KeyError for a topic of the ground's."""
+        """Send a message, which may be lost. Raises KeyError for a topic of the ground."""
         if topic != MESSAGE or self._robot_id is None:
             self._zenoh.publish(topic, data)
             return
         head = read_head(data)
         if head is not None:
             self._own_start = head.number.start
-        sending = GroupKey.of(self._group.keys().sending)
+        key = GroupKey.of(self._group.keys().sending)
         try:
             self._sender.setsockopt(
                 socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._group.interface)
             )
-            for datagram in datagrams(data, sender=self._robot_id, key=sending):
+            for datagram in datagrams(data, sender=self._robot_id, key=key):
                 self._sender.sendto(datagram, (self._group.address, self._group.port))
-        except (OSError, ValueError) as error:  # No network, a full queue, or too large a message.
+        except (OSError, ValueError) as error:  # no network, a full queue, or too large a message
             self._failed("publish", error)
 
     def is_claimed(self, robot_id: int) -> bool:
-        """Whether another session says that it is that robot."""
-        said_s = self._said_as_this_one_s
-        is_said = robot_id == self._robot_id and time.monotonic() - said_s < _CLAIMED_FOR_S
-        return is_said or self._zenoh.is_claimed(robot_id)
+        """Whether another program uses that robot id."""
+        claimed = time.monotonic() - self._claimed_at_s < _CLAIMED_FOR_S
+        return (claimed and robot_id == self._robot_id) or self._zenoh.is_claimed(robot_id)
 
     def peers(self) -> int:
-        """How many grounds it is connected to."""
+        """Number of connected grounds."""
         return self._zenoh.peers()
 
     def refused(self) -> int:
-        """How many messages it did not look at: too many at once, too large, or of strangers."""
+        """Number of messages dropped unread: above the rate, too large, or of non-members."""
         return self._zenoh.refused() + self._admission.refused + self._strangers
 
     def close(self) -> None:
-        """Leave the radio, within a second or so; again is no error."""
+        """Close the link, within about a second. May be repeated."""
         self._closed.set()
-        self._hearing.join(_CLOSE_TIMEOUT_S)
+        self._receiving.join(_CLOSE_TIMEOUT_S)
         self._sender.close()
         self._zenoh.close()
 
-    # Hearing
-
-    def _hear(self) -> None:
+    def _receive_until_closed(self) -> None:
         while not self._closed.is_set():
             try:
-                with _joined(self._group) as receiver:
-                    self._hear_from(receiver)
-            except Exception as error:  # No network yet; whatever it is, the next try may hear.
-                self._failed("hear the group", error)
-                self._closed.wait(_JOINS_AGAIN_S)
+                with _receiver(self._group) as receiver:
+                    self._receive(receiver)
+            except Exception as error:  # no network yet, or anything else: try again
+                self._failed("receive from the group", error)
+                self._closed.wait(_JOIN_RETRY_S)
 
-    def _hear_from(self, receiver: socket.socket) -> None:
-        """Until all have been silent for so long that it may be this membership that is lost."""
+    def _receive(self, receiver: socket.socket) -> None:
+        """Receive until no other member has sent for so long that the membership may be lost."""
         poll = select.poll()
         poll.register(receiver, select.POLLIN)
-        heard_at_s = counts_since_s = time.monotonic()
-        came, many_come = 0, False
-        while not self._closed.is_set() and time.monotonic() - heard_at_s < _REJOINS_AFTER_S:
-            if many_come and not poll.poll(0):
-                self._closed.wait(_TOGETHER_S)
+        received_at_s = window_began_s = time.monotonic()
+        count, in_batches = 0, False
+        while not self._closed.is_set() and time.monotonic() - received_at_s < _REJOIN_AFTER_S:
+            if in_batches and not poll.poll(0):
+                self._closed.wait(_BATCH_S)
             with suppress(TimeoutError):
                 data = receiver.recv(2048)
-                came += 1
-                self._follow_keys()
+                count += 1
+                self._update_keys()
                 fragment = open_datagram(data, self._keys)
                 if fragment is None or fragment.sender > self._greatest_id:
                     self._strangers += 1
                     continue
                 if not self._is_own(fragment):
-                    heard_at_s = time.monotonic()
+                    received_at_s = time.monotonic()
                     if fragment.sender == self._robot_id and not self._group.is_secret:
-                        self._said_as_this_one_s = heard_at_s
-                    self._take(fragment, heard_at_s)
-            counted_s = time.monotonic() - counts_since_s
-            if counted_s >= _COUNTS_FOR_S:
-                many_come = _MANY_HZ * counted_s < came < _FLOOD_HZ * counted_s
-                came, counts_since_s = 0, time.monotonic()
+                        self._claimed_at_s = received_at_s
+                    self._receive_fragment(fragment, received_at_s)
+            window_s = time.monotonic() - window_began_s
+            if window_s >= _RATE_WINDOW_S:
+                in_batches = _BATCH_HZ * window_s < count < _FLOOD_HZ * window_s
+                count, window_began_s = 0, time.monotonic()
 
-    def _follow_keys(self) -> None:
-        """Hear by the keys as they are now; what was told of a sender's key is over with them."""
+    def _update_keys(self) -> None:
         keys = self._group.keys()
         if keys != self._known:
             self._known, self._keys = keys, tuple(map(GroupKey.of, keys.receiving))
-            self._assembly = Assembly(math.inf if self._group.is_secret else _FORGETS_AFTER_S)
+            # The old assembly refers to keys by their places in the old list.
+            self._assembly = Assembly(math.inf if self._group.is_secret else _FORGET_SENDER_S)
 
-    def _take(self, fragment: Fragment, now_s: float) -> None:
-        # Of an envelope of another version only the sender is known.
+    def _receive_fragment(self, fragment: Fragment, now_s: float) -> None:
+        # An envelope of another version reveals only its sender.
         is_known = fragment.number != NO_NUMBER
         message = self._assembly.add(fragment, now_s, time.time()) if is_known else fragment.head
         if message is None or self._on_message is None:
             return
         key = f"robot/{fragment.sender}/{MESSAGE.name}"
-        # Who has a former key alone takes nothing from those who have the present one.
-        share = f"{fragment.key}/{key}"
-        if not self._admission.admits(MESSAGE, share, len(message), now_s):
+        # A sender that has only the former key must not use up the budget of the present key.
+        budget = f"{fragment.key}/{key}"
+        if not self._admission.admits(MESSAGE, budget, len(message), now_s):
             return
         try:
-            is_theirs = self._on_message(key, message)
+            is_authentic = self._on_message(key, message)
         except Exception as error:
             self._failed("callback", error)
             return
-        if is_theirs is not False:
+        if is_authentic is not False:
             self._assembly.confirm(fragment, now_s)
 
     def _is_own(self, fragment: Fragment) -> bool:
-        """Whether it comes back, or a stranger says it again, even from before this program began.
+        """Whether it is this robot's own: looped back, or replayed, even from an earlier start.
 
-        Of two members with one id the other hears this one, which began later.
+        If two members share an id, the one that started earlier receives the other's messages.
         """
         start = fragment.number.start
         is_start = start <= self._own_start if self._group.is_secret else start == self._own_start
@@ -206,32 +202,32 @@ class MulticastLink:
 
     def _failed(self, what: str, error: Exception) -> None:
         with self._lock:
-            self._problems[what] += 1
-            first = self._problems[what] == 1
+            self._failures[what] += 1
+            first = self._failures[what] == 1
         if first:
             log.error("link failure", exc_info=error, what=what)
 
 
-def _sending() -> socket.socket:
+def _sender() -> socket.socket:
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sender.setblocking(False)
     sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
-    # A simulated fleet's other robots are on this computer.
+    # The other robots of a simulated fleet are on this computer.
     sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
     return sender
 
 
-def _joined(group: Group) -> socket.socket:
-    """Raises OSError where there is no such network now."""
+def _receiver(group: Group) -> socket.socket:
+    """A socket that has joined the group. Raises OSError without a network."""
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-        # To the group's own address, so that nothing else comes in.
+        # Bound to the group's address, so that it receives no other datagrams.
         receiver.bind((group.address, group.port))
         membership = socket.inet_aton(group.address) + socket.inet_aton(group.interface)
         receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-        receiver.settimeout(_WAKES_S)
+        receiver.settimeout(_RECEIVE_TIMEOUT_S)
     except OSError:
         receiver.close()
         raise

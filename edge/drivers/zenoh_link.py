@@ -1,18 +1,18 @@
-"""The radio of the robots and the ground, over zenoh.
+"""Radio link of robots and ground stations over zenoh.
 
-What travels is in `edge.messages.topics`, below the key `lpac/<fleet>/`. Besides, for presence,
-there are the liveliness tokens `robot/<id>/alive/<session>`, which vanish with the session that
-declared them: at once if the program ends, 1.5 s after it stops answering.
+`edge.messages.topics` lists the topics, which are below the key `lpac/<fleet>/`. Presence is
+reported by liveliness tokens `robot/<id>/alive/<session>`, which vanish with their session: at once
+if the program ends, 1.5 s after it stops answering.
 
-In peer mode gossip makes a mesh from one known peer, but what only gossip connected is not
-connected again when it alone is lost; scouting does it within some 8 s. So for flight let every
-robot's `connect` name all robots with smaller ids, and the ground's all robots: the configured side
-tries again for ever. Never name each other: two sides that connect at once after a cut may end up
-connected and yet deaf to each other.
+In peer mode, gossip makes a mesh from one known peer. A connection made only by gossip is not made
+again after it is lost; scouting makes it again within about 8 s. For flight, therefore, every
+robot's `connect` must name all robots with smaller ids, and the ground's all robots: configured
+connections are retried for ever. Two sides must not name each other: if both connect at once after
+a cut, they may end up connected without receiving each other's messages.
 
-With TLS both sides show a certificate of the fleet's authority, and what a peer says is taken by
-its certificate's common name: `robot-<id>` below its own key, `operator` below the ground's,
-`observer` there a hold only. Names of hosts are not looked at, since robots have none.
+With TLS both sides present a certificate of the fleet's authority, and access rules apply to its
+common name: `robot-<id>` may publish below its own key, `operator` below the ground's, `observer`
+only a hold there. Host names are not verified, since robots have none.
 """
 
 import atexit
@@ -34,7 +34,7 @@ import zenoh
 from edge.core.address import is_loopback, is_loopback_endpoint, require_endpoint
 from edge.core.logger import log
 from edge.core.wire import MAX_ROBOT_ID
-from edge.drivers.door import Door, DoorStatus, listening
+from edge.drivers.door import Door, DoorStatus, listening_sockets
 from edge.messages.admission import Admission
 from edge.messages.topics import (
     HOLD,
@@ -46,39 +46,39 @@ from edge.messages.topics import (
     Topic,
 )
 
-# Of 64 kB each, for topics that go later: a world that does not fit in there at once is dropped.
-_PATIENT_BATCHES = 8
+# Batches of 64 kB for topics of low priority. A world larger than the queue is dropped.
+_BACKGROUND_BATCHES = 8
 _TOKEN = re.compile(r"robot/(\d{1,5})/alive/(\w{1,32})")
-# Of all topics' limits the largest, and what zenoh says besides.
+# The largest topic's limit, and zenoh's own overhead.
 _MOST_BYTES = max(topic.limit_bytes for topic in TOPICS) + 2**12
 _MOST_TOKENS = 1000
-# As many as PX4's system ids, of which every vehicle has one of its own.
+# PX4's largest system id: every vehicle has its own.
 MAX_CERTIFIED_ID = 255
 _CLOSE_TIMEOUT_S = 1.0
-_KNOCKS_EVERY_S = 0.5
+_KNOCK_PERIOD_S = 0.5
 _CLOSE_AT_EXIT_S = 1.5
 
-# zenoh closes TCP sockets with a linger time of 10 s, which holds the closing thread for as long if
-# the other end is out of reach. With zenoh's few threads, two lost neighbours would make a robot
-# deaf to all others. Here each neighbour lost within 10 s may hold one of those that receive, which
-# find others, too; those that send are none of them.
+# zenoh closes TCP sockets with a linger time of 10 s, which blocks the closing thread that long if
+# the other end is out of reach. With zenoh's few default threads, two lost neighbours would stop a
+# robot's reception from all others. With these settings, each neighbour lost within 10 s blocks at
+# most one of 16 receiving threads, and no sending thread.
 _RUNTIME = "(net: (handover: rx), rx: (worker_threads: 16))"
 
 _ADVICE = {
-    "Address already in use": "another program has this port; does this robot's already run?",
+    "Address already in use": "another program has this port; is this robot's already running?",
     "Cannot assign requested address": "this machine has no such address",
 }
 
 
 class LinkError(OSError):
-    """The link cannot be opened; the text says which endpoint or setting, and what to do."""
+    """The link cannot be opened; the text names the endpoint or setting and the remedy."""
 
 
 class ZenohLink:
-    """A session on the radio: a robot's, or with `robot_id` None the ground's.
+    """A zenoh session of a robot, or with `robot_id` None of the ground.
 
-    Every method may be called from any thread. Close it, or use it as a context manager: the
-    interpreter does not exit while it is open.
+    Thread-safe. Close it, or use it as a context manager: the interpreter does not exit while it is
+    open.
     """
 
     def __init__(
@@ -96,19 +96,19 @@ class ZenohLink:
     ) -> None:
         """Open the session.
 
-        `listen` and `connect` are endpoints, `tcp/<host>:<port>`, or with `tls` all of them
-        `tls/<host>:<port>`; without `listen` it takes a free port. It opens even if nobody answers,
-        and connects later. `scouting` finds others by multicast, as gossip does by those that are
-        connected; without `autoconnect` it calls none of them, and they call it. With `members` it
-        keeps strangers from the port that it listens on, unless those that scouting finds call
-        there, and knocks at others' (`edge.drivers.door`).
+        `listen` and `connect` are endpoints, `tcp/<host>:<port>`, or with `tls` all
+        `tls/<host>:<port>`; without `listen` the session takes a free port. It opens even if no
+        peer answers, and connects later. `scouting` finds peers by multicast, gossip by those
+        already connected; without `autoconnect` the session waits for those peers to connect. With
+        `members` it knocks at others' ports and protects its own (`edge.drivers.door`); with
+        `scouting`, which finds peers that cannot knock, its own port stays open.
 
-        `subscriptions` maps topics to callbacks. They are called with the key below `lpac/<fleet>/`
-        and the data, from zenoh's threads, several at once; what this session publishes is not
-        among it, nor what is larger than its topic's limit. A callback must only store: a slow one
-        holds up the link.
+        `subscriptions` maps topics to callbacks. zenoh's threads call them, also concurrently, with
+        the key below `lpac/<fleet>/` and the data. They get neither this session's own messages
+        nor any larger than the topic's limit. A callback must only store: a slow one holds up the
+        link.
 
-        Raises LinkError if a setting is wrong, or a port is taken.
+        Raises LinkError if a setting is wrong or a port is taken.
         """
         _check(fleet, robot_id, listen, connect, tls)
         own: SenderKind = "ground" if robot_id is None else "robot"
@@ -127,13 +127,12 @@ class ZenohLink:
         )
         opened: list[zenoh.Session] = []
         if members is not None:
-            # From before the first call on, which strangers make in vain.
+            # Start before the first connection attempt, which only known addresses can make.
             Thread(
                 target=self._knock, name="knock", args=(members, connect, opened), daemon=True
             ).start()
         try:
-            # Members that found this port by scouting do not know where to knock.
-            self._session, self._doors = _open_behind_doors(config, None if scouting else members)
+            self._session, self._doors = _open_with_doors(config, None if scouting else members)
         except BaseException:
             self._closed.set()
             raise
@@ -151,9 +150,10 @@ class ZenohLink:
         self.close()
 
     def publish(self, topic: Topic, data: bytes) -> None:
-        """Send on a topic of robots, or of the ground, as this session is one or the other.
+        """Publish on a topic of this session's side, robot or ground.
 
-        Dropped when the link is congested or closed. Raises KeyError for a topic of the others.
+        The message is dropped if the link is congested or closed. Raises KeyError for a topic of
+        the other side.
         """
         publisher = self._publishers[topic]
         try:
@@ -161,48 +161,42 @@ class ZenohLink:
         except zenoh.ZError as error:
             self._failed(f"publish {topic.name}", error)
 
-    def present(self) -> frozenset[int]:
-        """The other robots whose programs are connected now."""
-        return frozenset(id_ for id_ in self._others() if id_ != self._robot_id)
-
     def is_claimed(self, robot_id: int) -> bool:
-        """Whether another session says that it is that robot.
+        """Whether another session uses that robot id.
 
-        Up to 1.5 s after a restart that may be the own former session.
+        Within 1.5 s of a restart this may be the program's own former session.
         """
-        return robot_id in self._others()
+        with self._lock:
+            return any(
+                id_ == robot_id and session != self._session_id for id_, session in self._tokens
+            )
 
     def peers(self) -> int:
-        """The number of zenoh sessions connected to this one."""
+        """Number of connected zenoh sessions."""
         try:
             return len(self._session.info.peers_zid())
         except zenoh.ZError:  # closed
             return 0
 
     def refused(self) -> int:
-        """How many messages it did not look at: too many at once, or too large."""
+        """Number of messages dropped unread: above the rate, or too large."""
         return self._admission.refused
 
     def doors(self) -> list[DoorStatus]:
-        """How it stands with each port that other computers reach."""
+        """State of each port that other computers reach."""
         return [door.status for door in self._doors]
 
-    def failures(self) -> int:
-        """How many calls of callbacks and of `publish` failed; each kind's first is logged."""
-        with self._lock:
-            return self._failures.total()
-
     def close(self) -> None:
-        """Leave the radio, within a second or so; again is no error."""
+        """Close the session, within about a second. May be repeated."""
         self._closed.set()
         for door in self._doors:
             door.close()
-        # A connection whose other end is out of reach holds it, too.
+        # Closing may block on a connection whose other end is out of reach.
         closing = Thread(target=self._close_session, daemon=True)
         closing.start()
         closing.join(_CLOSE_TIMEOUT_S)
         if closing.is_alive():
-            # What comes back from zenoh into an interpreter that is ending aborts the program.
+            # A callback from zenoh into an interpreter that is exiting aborts the program.
             atexit.register(closing.join, _CLOSE_AT_EXIT_S)
 
     def _close_session(self) -> None:
@@ -214,19 +208,19 @@ class ZenohLink:
     def _knock(
         self, members: Knocking, connect: Sequence[str], opened: Sequence[zenoh.Session]
     ) -> None:
-        """At each port that it is to be connected to, until it is."""
+        """Knock at each configured port that is not connected, until the link is closed."""
         places = [endpoint.partition("/")[2] for endpoint in connect]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
             udp.setblocking(False)
             while True:
-                met = [place for session in opened for place in _met(session)]
+                connected = [place for session in opened for place in _peer_places(session)]
                 for place in places:
                     host, _, port = place.rpartition(":")
-                    if place not in met and not is_loopback(host):
-                        with suppress(OSError):  # No network yet, or nobody of that name.
+                    if place not in connected and not is_loopback(host):
+                        with suppress(OSError):  # no network yet, or no such host
                             address = socket.gethostbyname(host)
                             udp.sendto(members.knock(f"{address}:{port}"), (address, int(port)))
-                if self._closed.wait(_KNOCKS_EVERY_S):
+                if self._closed.wait(_KNOCK_PERIOD_S):
                     return
 
     def _declare(
@@ -245,12 +239,12 @@ class ZenohLink:
             history=True,
         )
         if self._robot_id is not None:
-            # Kept, since a token that nothing refers to is withdrawn.
+            # Stored, since a token without references is withdrawn.
             self._token = liveliness.declare_token(f"{self._own_prefix}alive/{self._session_id}")
         return {
             topic: session.declare_publisher(
                 self._own_prefix + topic.name,
-                # The newest counts, at once: nothing queues up.
+                # Only the newest message matters: drop rather than queue.
                 congestion_control=zenoh.CongestionControl.DROP,
                 express=True,
                 priority=(
@@ -295,11 +289,6 @@ class ZenohLink:
             elif len(self._tokens) < _MOST_TOKENS:
                 self._tokens.add(token)
 
-    def _others(self) -> frozenset[int]:
-        """The robot ids that other sessions claim."""
-        with self._lock:
-            return frozenset(id_ for id_, session in self._tokens if session != self._session_id)
-
 
 def _config(
     prefix: str,
@@ -310,17 +299,17 @@ def _config(
     autoconnect: bool,
     tls: TlsFiles | None,
 ) -> zenoh.Config:
-    # Of two sessions that find each other by scouting or gossip, the one of the greater id
-    # connects: the same side as the configured endpoints make it.
+    # If two sessions find each other by scouting or gossip, the one with the greater id connects,
+    # as in configured endpoints.
     found = {
         "autoconnect": {"peer": ["peer"] if autoconnect else []},
         "autoconnect_strategy": {"peer": {"to_peer": "greater-zid"}},
     }
-    # A call to somebody out of reach is repeated by the kernel after 1 s, and given up after 2:
-    # whoever is back soon is called again within 1.1 s. One whose program is down refuses each
-    # call at once, and soon is called seldom.
+    # The kernel repeats an attempt to an unreachable peer after 1 s; the attempt ends after 2 s. A
+    # peer that is back soon is connected within 1.1 s. A peer whose program is down refuses at
+    # once, so the period grows to 0.5 s.
     retry = {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5}
-    # Who calls nobody elsewhere need not be called from there.
+    # A session that connects only to this computer accepts connections only from it.
     host = "127.0.0.1" if connect and all(map(is_loopback_endpoint, connect)) else "0.0.0.0"
     listen = listen or (f"{'tcp' if tls is None else 'tls'}/{host}:0",)
     config = zenoh.Config()
@@ -334,17 +323,16 @@ def _config(
         "scouting/delay": 0,
         "scouting/multicast": {"enabled": scouting, **found},
         "scouting/gossip": found,
-        # How soon a lost neighbour is noticed, ms; and how many signs of life that is. Whoever
-        # speaks more often, as robots do in flight, sends none besides: with a sign each
-        # quarter of a second, ten robots' took a quarter of a channel's time.
+        # A lost neighbour is noticed after 1500 ms, three keep-alive messages. None are sent while
+        # other messages are, as in flight. With one every 250 ms, those of ten robots took a
+        # quarter of a channel's airtime.
         "transport/link/tx/lease": 1500,
         "transport/link/tx/keep_alive": 3,
-        "transport/link/tx/queue/size/background": _PATIENT_BATCHES,
-        # An attempt that a lost packet holds up is given up soon, and made again.
+        "transport/link/tx/queue/size/background": _BACKGROUND_BATCHES,
+        # An attempt that is held up by a lost packet ends soon and is repeated.
         "transport/unicast/open_timeout": 2000,
         "transport/unicast/accept_timeout": 2000,
-        # What is larger is never held in memory, and what is larger than its topic allows not
-        # handed on.
+        # Larger messages are never held in memory; those above their topic's limit are dropped.
         "transport/link/rx/max_message_size": _MOST_BYTES,
         "low_pass_filter": [
             {
@@ -355,7 +343,7 @@ def _config(
             }
             for topic in TOPICS
         ],
-        # A state of its own for each connection, and before anything reaches this program.
+        # Applies to each connection separately, before anything reaches Python.
         "downsampling": [
             {
                 "flows": ["ingress"],
@@ -367,7 +355,7 @@ def _config(
                 ],
             }
         ],
-        # 200 MB among ten robots, for no gain.
+        # It would take 200 MB for ten robots, without gain.
         "transport/shared_memory/enabled": False,
     }.items():
         config.insert_json5(key, json.dumps(value))
@@ -375,7 +363,7 @@ def _config(
 
 
 def _tls(prefix: str, tls: TlsFiles) -> dict[str, object]:
-    """Only members get in, and say only what is theirs."""
+    """TLS with certificates on both sides, and access rules by their names."""
     return {
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
@@ -392,39 +380,39 @@ def _tls(prefix: str, tls: TlsFiles) -> dict[str, object]:
 
 
 def _access_control(prefix: str) -> dict[str, object]:
-    """Access rules below the prefix: publishers by their certificates' names; all hear all."""
-    may_say = {
+    """Access rules: each certificate's name may publish below its keys; all may subscribe."""
+    publishers = {
         "operator": [f"{prefix}ground/**"],
         "observer": [f"{prefix}ground/{HOLD.name}"],
         **{f"robot-{id_}": [f"{prefix}robot/{id_}/**"] for id_ in range(MAX_CERTIFIED_ID + 1)},
     }
-    listening = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
-    saying = ["put", "liveliness_token", "reply"]
+    subscribe = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
+    publish = ["put", "liveliness_token", "reply"]
     everything = {"permission": "allow", "key_exprs": [f"{prefix}**"]}
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": [
-            {"id": "to all", "flows": ["egress"], "messages": listening + saying, **everything},
-            {"id": "listening", "flows": ["ingress"], "messages": listening, **everything},
+            {"id": "to all", "flows": ["egress"], "messages": subscribe + publish, **everything},
+            {"id": "subscribe", "flows": ["ingress"], "messages": subscribe, **everything},
             *(
                 {
                     "id": name,
                     "permission": "allow",
                     "flows": ["ingress"],
-                    "messages": saying,
+                    "messages": publish,
                     "key_exprs": keys,
                 }
-                for name, keys in may_say.items()
+                for name, keys in publishers.items()
             ),
         ],
         "subjects": [
             {"id": "all"},
-            *({"id": name, "cert_common_names": [name]} for name in may_say),
+            *({"id": name, "cert_common_names": [name]} for name in publishers),
         ],
         "policies": [
-            {"rules": ["to all", "listening"], "subjects": ["all"]},
-            *({"rules": [name], "subjects": [name]} for name in may_say),
+            {"rules": ["to all", "subscribe"], "subjects": ["all"]},
+            *({"rules": [name], "subjects": [name]} for name in publishers),
         ],
     }
 
@@ -440,7 +428,7 @@ def _check(
         raise LinkError(f"fleet = {fleet!r}: must be letters, digits, '-' and '_'")
     if robot_id is not None and not 0 <= robot_id <= MAX_ROBOT_ID:
         raise LinkError(f"robot_id = {robot_id}: must be from 0 to {MAX_ROBOT_ID}")
-    # zenoh itself would wait for ever for an endpoint that cannot be.
+    # zenoh itself would wait for ever for an invalid endpoint.
     try:
         for name, endpoints in (("listen", listen), ("connect", connect)):
             for endpoint in endpoints:
@@ -452,37 +440,39 @@ def _check(
 
 
 def _session_id(robot_id: int | None) -> str:
-    """Unique, and ordered as robot ids are, the ground after all robots.
+    """Unique id, ordered by robot id, with the ground after all robots.
 
-    zenoh compares the bytes from the end of the text.
+    zenoh compares ids from the last byte.
     """
     rank = MAX_ROBOT_ID + 1 if robot_id is None else robot_id
     return f"1{secrets.token_hex(12)}{rank.to_bytes(3, 'little').hex()}"
 
 
-def _open_behind_doors(
+def _open_with_doors(
     config: zenoh.Config, members: Knocking | None
 ) -> tuple[zenoh.Session, list[Door]]:
-    """A session, and a door for each port of it that other computers reach."""
+    """Open a session, and a door for each of its ports that other computers reach."""
     if members is None:
         return _open(config), []
     with ExitStack() as others:
-        before = {inode: others.enter_context(found) for inode, found in listening().items()}
+        before = {
+            inode: others.enter_context(found) for inode, found in listening_sockets().items()
+        }
         session = _open(config)
     doors = []
-    for inode, found in listening().items():
+    for inode, found in listening_sockets().items():
         if inode in before or is_loopback(found.getsockname()[0]):
             found.close()
         else:
             try:
-                doors.append(Door(found, members, partial(_met_addresses, session)))
+                doors.append(Door(found, members, partial(_peer_addresses, session)))
             except OSError as error:
                 log.error("the radio's port is open to strangers", why=str(error))
     return session, doors
 
 
-def _met(session: zenoh.Session) -> list[str]:
-    """The IPv4 addresses of all who are connected, each with its port."""
+def _peer_places(session: zenoh.Session) -> list[str]:
+    """IPv4 address:port of each connected peer."""
     try:
         links = session.info.links()
     except zenoh.ZError:  # closed
@@ -491,8 +481,8 @@ def _met(session: zenoh.Session) -> list[str]:
     return [place[1] for place in places if place is not None]
 
 
-def _met_addresses(session: zenoh.Session) -> list[str]:
-    return [place.partition(":")[0] for place in _met(session)]
+def _peer_addresses(session: zenoh.Session) -> list[str]:
+    return [place.partition(":")[0] for place in _peer_places(session)]
 
 
 def _open(config: zenoh.Config) -> zenoh.Session:

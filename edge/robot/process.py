@@ -30,8 +30,8 @@ from edge.drivers.flight_log import FlightLog
 from edge.drivers.identity_folder import (
     GROUP_KEYS,
     Identity,
-    listening_identity,
     load_identity,
+    receiving_identity,
 )
 from edge.drivers.logs import log_to
 from edge.drivers.process_lock import ProcessLock
@@ -142,7 +142,7 @@ def run(config: RobotConfig, stop: Stop) -> None:
         # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
         take_up = None
         if identity is not None and signed is not None:
-            take_up = partial(identity.take_up, signed)
+            take_up = partial(identity.update, signed)
         program = _Program(config, node, vehicle, watchdog, recorder, link, take_up)
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
@@ -393,7 +393,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
         parts.enter_context(_robot_lock(config))
         show("error")
         clock = SystemClock()
-        identity = _identity(config, listening_identity)
+        identity = _identity(config, receiving_identity)
         vehicle, setup, _ = parts.enter_context(_open_vehicle(config))
         looking = _OnlyLooking(vehicle)
         node = RobotNode(

@@ -32,9 +32,9 @@ from edge.drivers.identity_folder import (
     KEY_PEM,
     MEMBERS,
     group_keys_text,
-    listening_identity,
     read_group_keys,
     read_members,
+    receiving_identity,
 )
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID
 from edge.identity.group import KEY_BYTES
@@ -139,7 +139,7 @@ class Authority:
     def own_name(self) -> str | None:
         """Name of the operator whose identity this folder is, or None."""
         try:
-            return listening_identity(self.folder, fleet=self.fleet).membership.own.name
+            return receiving_identity(self.folder, fleet=self.fleet).membership.own.name
         except (OSError, ConfigError):
             return None
 

@@ -69,7 +69,7 @@ class GroundProcess:
         guard = None if identity is None else identity.guard(clock.monotonic_s)
         self._take_up = (
             None if identity is None or guard is None
-            else partial(identity.take_up, guard)
+            else partial(identity.update, guard)
         )  # fmt: skip
         self._node = GroundNode(
             config.setup, clock, self, guard or Unguarded(int(1e3 * clock.unix_s()))

@@ -150,7 +150,7 @@ def test_an_identity_has_room_kept_for_it(disk: Path, tmp_path: Path) -> None:
     fill(disk)
     identity = load_identity(folder, fleet="demo", unix_s=3e9)
     assert (folder / "start").read_text() == f"{identity.membership.start}\n" == "3000000000000\n"
-    identity.take_up(identity.guard(lambda: 0.0))
+    identity.update(identity.guard(lambda: 0.0))
 
 
 def test_an_identity_on_a_read_only_disk_starts_all_the_same(disk: Path, tmp_path: Path) -> None:
@@ -167,8 +167,8 @@ def test_an_identity_on_a_read_only_disk_starts_all_the_same(disk: Path, tmp_pat
         assert 2e12 < starts[0].membership.start < starts[1].membership.start
         guard = starts[1].guard(lambda: 0.0)
         with pytest.raises(OSError) as raised:
-            starts[1].take_up(guard)
+            starts[1].update(guard)
         assert (raised.value.errno, raised.value.filename) == (errno.EROFS, str(folder / "start"))
-    starts[1].take_up(guard)
+    starts[1].update(guard)
     later = load_identity(folder, fleet="demo", unix_s=5.0)
     assert later.membership.start == starts[1].membership.start + 1

@@ -42,7 +42,7 @@ def port() -> Iterator[socket.socket]:
 def seen(flood: Flood, until_s: float, refused: Callable[[float], int]) -> list[bool]:
     """Looked at 20 times a second, from 100.0 s on."""
     steps = round(20 * (until_s - 100.0))
-    return [flood.look(at_s, refused(at_s)) for at_s in (100.0 + n / 20 for n in range(steps))]
+    return [flood.update(at_s, refused(at_s)) for at_s in (100.0 + n / 20 for n in range(steps))]
 
 
 def test_a_fleet_that_calls_at_once_after_a_start_is_no_flood() -> None:
@@ -108,7 +108,7 @@ def test_with_scouting_the_port_is_open_to_all(monkeypatch: pytest.MonkeyPatch) 
         asked.append(members)
         raise zenoh_link.LinkError("not here")
 
-    monkeypatch.setattr(zenoh_link, "_open_behind_doors", open_behind)
+    monkeypatch.setattr(zenoh_link, "_open_with_doors", open_behind)
     with pytest.raises(zenoh_link.LinkError, match="not here"):
         ZenohLink(fleet="demo", scouting=True, members=Members())
     assert asked == [None]
@@ -119,7 +119,7 @@ def test_a_member_knocks_at_each_port_of_an_address(
 ) -> None:
     """Of robots that share a computer it is connected to one; the other is not there yet."""
     monkeypatch.setattr(zenoh_link, "is_loopback", lambda _: False)
-    monkeypatch.setattr(zenoh_link, "_open_behind_doors", lambda c, _: (zenoh_link._open(c), []))
+    monkeypatch.setattr(zenoh_link, "_open_with_doors", lambda c, _: (zenoh_link._open(c), []))
     there = endpoint()
     absent = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     with (

@@ -24,7 +24,7 @@ from edge.identity.replay_window import MessageNumber
 from edge.identity.signature import Signer
 from edge.messages.topics import MESSAGE, STATUS, Group, GroupKeys, Link, LinkSetting
 from lpac.sim.ports import free_ports
-from tests.process.drivers.test_zenoh_link import Inbox, endpoint, eventually
+from tests.process.drivers.test_zenoh_link import Inbox, endpoint, eventually, present
 
 KEY, FORMER = b"k" * 32, b"f" * 32
 AUTHORITY = Signer(b"a" * 32)
@@ -164,7 +164,7 @@ def test_everything_else_goes_to_the_ground(group: Group) -> None:
             return "robot/1/status" in said.newest and "r1" in second.heard
 
         eventually(both)
-        eventually(lambda: ground.present() == {1, 2} and first.radio.peers() == 1)
+        eventually(lambda: present(ground) == {1, 2} and first.radio.peers() == 1)
         # It would cross the air once more for each robot.
         assert "robot/1/message" not in said.newest
 
@@ -417,8 +417,8 @@ def test_what_many_say_is_heard_as_well_when_it_is_taken_together(
     group: Group, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A few say it here, and count as many."""
-    monkeypatch.setattr(multicast, "_MANY_HZ", 1.0)
-    monkeypatch.setattr(multicast, "_COUNTS_FOR_S", 0.1)
+    monkeypatch.setattr(multicast, "_BATCH_HZ", 1.0)
+    monkeypatch.setattr(multicast, "_RATE_WINDOW_S", 0.1)
     said = [b"%d" % i for i in range(60)]
     with Robot(group, 1) as first, Robot(group, 2) as second:
         eventually_hear(first, b"here", second)
@@ -442,14 +442,14 @@ def test_without_a_network_it_opens_and_waits_for_one(group: Group) -> None:
 def test_a_robot_that_hears_only_itself_joins_again(
     group: Group, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    join, joined = multicast._joined, []
+    join, joined = multicast._receiver, []
 
     def joining(its: Group) -> socket.socket:
         joined.append(join(its))
         return joined[-1]
 
-    monkeypatch.setattr(multicast, "_REJOINS_AFTER_S", 0.5)
-    monkeypatch.setattr(multicast, "_joined", joining)
+    monkeypatch.setattr(multicast, "_REJOIN_AFTER_S", 0.5)
+    monkeypatch.setattr(multicast, "_receiver", joining)
     with Robot(group, 1) as first:
 
         def again() -> bool:

@@ -41,7 +41,9 @@ class Robot:
         self.heard[key.split("/")[1]] = self.heard.get(key.split("/")[1], 0) + 1
 
     def seen(self):
-        return {"heard": dict(self.heard), "present": sorted(self.link.present())}
+        with self.link._lock:
+            present = {id_ for id_, _ in self.link._tokens} - {self.link._robot_id}
+        return {"heard": dict(self.heard), "present": sorted(present)}
 
 print("started", flush=True)
 sys.stdin.readline()
@@ -97,8 +99,14 @@ def eventually(
         time.sleep(0.01)
 
 
+def present(link: ZenohLink) -> set[int]:
+    """Ids of the other robots whose programs are connected."""
+    with link._lock:
+        return {robot_id for robot_id, _ in link._tokens} - {link._robot_id}
+
+
 def is_present(link: ZenohLink, robot_ids: set[int]) -> bool:
-    return link.present() == robot_ids
+    return present(link) == robot_ids
 
 
 def has_peers(link: ZenohLink, count: int) -> bool:
@@ -191,7 +199,7 @@ def test_robots_that_know_one_peer_hear_all_others_and_not_themselves() -> None:
             eventually(partial(is_present, link, others_ids))
             eventually(partial(has_peers, link, 2))
             assert not link.is_claimed(robot_id)
-            assert link.failures() == 0
+            assert link._failures.total() == 0
 
 
 def test_the_ground_speaks_to_all_robots_and_is_none() -> None:
@@ -208,8 +216,8 @@ def test_the_ground_speaks_to_all_robots_and_is_none() -> None:
         for topic in (STATE, ORDER):
             eventually_hears(ground, topic, topic.name.encode(), topic.pattern, commands)
         eventually_hears(robot, STATUS, b"fine", "robot/7/status", statuses)
-        eventually(lambda: ground.present() == {7})
-        assert robot.present() == frozenset()
+        eventually(lambda: present(ground) == {7})
+        assert present(robot) == frozenset()
 
 
 def test_without_autoconnect_robots_are_connected_to_grounds_alone() -> None:
@@ -239,9 +247,9 @@ def test_without_autoconnect_robots_are_connected_to_grounds_alone() -> None:
                 eventually_hears(one, STATE, what * 2, "ground/state", states)
                 eventually_hears(one, STATE, what, "ground/state", statuses[1])
                 eventually_hears(other, STATE, what, "ground/state", statuses[0])
-                eventually(lambda: one.present() == {0, 1} and one.peers() == 3)
+                eventually(lambda: present(one) == {0, 1} and one.peers() == 3)
                 assert first.peers() == second.peers() == 2
-                assert first.present() == second.present() == frozenset()
+                assert present(first) == present(second) == frozenset()
             eventually(lambda: first.peers() == second.peers() == 1)
 
 
@@ -256,22 +264,22 @@ def test_scouting_finds_the_others() -> None:
         ZenohLink(fleet=fleet, robot_id=1, scouting=True) as first,
         ZenohLink(fleet=fleet, robot_id=2, scouting=True, subscriptions={MESSAGE: heard}) as second,
     ):
-        eventually(lambda: first.present() == {2} and second.present() == {1})
+        eventually(lambda: present(first) == {2} and present(second) == {1})
         eventually_hears(first, MESSAGE, b"hello", "robot/1/message", heard)
 
 
 def test_peers_start_in_any_order() -> None:
     late = endpoint()
     with ZenohLink(fleet="test", robot_id=2, connect=[late]) as early:
-        assert early.present() == frozenset()
+        assert present(early) == frozenset()
         with ZenohLink(fleet="test", robot_id=1, listen=[late]):
-            eventually(lambda: early.present() == {1})
+            eventually(lambda: present(early) == {1})
 
 
 def test_neighbours_join_leave_and_come_back() -> None:
     with fleet_of(2) as (links, inboxes):
         known = endpoint()
-        eventually(lambda: links[0].present() == {1} and links[1].present() == {0})
+        eventually(lambda: present(links[0]) == {1} and present(links[1]) == {0})
         with ZenohLink(fleet="test", robot_id=10, listen=[known]) as first:
             for sequence in (b"first", b"second"):
                 with ZenohLink(
@@ -280,9 +288,9 @@ def test_neighbours_join_leave_and_come_back() -> None:
                     connect=[known],
                     subscriptions={MESSAGE: inboxes[0]},
                 ):
-                    eventually(lambda: first.present() == {11})
+                    eventually(lambda: present(first) == {11})
                     eventually_hears(first, MESSAGE, sequence, "robot/10/message", inboxes[0])
-                eventually(lambda: first.present() == frozenset())
+                eventually(lambda: present(first) == frozenset())
 
 
 def test_a_killed_neighbour_leaves_and_its_successor_is_heard() -> None:
@@ -294,11 +302,11 @@ def test_a_killed_neighbour_leaves_and_its_successor_is_heard() -> None:
         ) as link:
             for _ in range(2):
                 with Robots({"robot_id": 6, "connect": [known]}).open() as robots:
-                    eventually(lambda: link.present() == {6})
+                    eventually(lambda: present(link) == {6})
                     everybody.newest.clear()
                     eventually(lambda: everybody.from_robot(6))
                     robots.process.kill()
-                    eventually(lambda: link.present() == frozenset())
+                    eventually(lambda: present(link) == frozenset())
         eventually_hears(links[0], MESSAGE, b"still here", "robot/0/message", inboxes[1])
 
 
@@ -316,12 +324,12 @@ def test_messages_flow_again_with_a_process_that_was_stopped() -> None:
 
         eventually(heard_back)
         robots.process.send_signal(signal.SIGSTOP)
-        eventually(lambda: link.present() == frozenset())
+        eventually(lambda: present(link) == frozenset())
         for _ in range(100):  # a publisher that is not stopped by what the other does not take
             heard_back()
         heard_before = heard_back()
         robots.process.send_signal(signal.SIGCONT)
-        eventually(lambda: link.present() == {2})
+        eventually(lambda: present(link) == {2})
         eventually(lambda: heard_back() > heard_before + 10)
 
 
@@ -336,7 +344,7 @@ def test_two_robots_of_one_id_are_seen_by_both() -> None:
         eventually(lambda: first.is_claimed(3) and second.is_claimed(3))
         eventually(lambda: other.is_claimed(3) and ground.is_claimed(3))
         assert not other.is_claimed(4) and not ground.is_claimed(5)
-        eventually(lambda: first.present() == {4})
+        eventually(lambda: present(first) == {4})
         second.close()
         eventually(lambda: not first.is_claimed(3))
         assert not links[0].is_claimed(0)
@@ -357,7 +365,7 @@ def test_a_callback_that_raises_stops_nothing() -> None:
     ):
         for data in (b"one", b"two"):
             eventually_hears(sender, MESSAGE, data, "robot/2/message", inbox)
-        eventually(lambda: link.failures() == inbox.count >= 2)
+        eventually(lambda: link._failures.total() == inbox.count >= 2)
 
 
 def test_another_fleet_hears_nothing() -> None:
@@ -374,8 +382,8 @@ def test_another_fleet_hears_nothing() -> None:
     ):
         eventually(lambda: stranger.peers() == 2)
         eventually_hears(sender, MESSAGE, b"ours", "robot/2/message", inbox)
-        eventually(lambda: link.present() == {2})
-        assert stranger.present() == frozenset()
+        eventually(lambda: present(link) == {2})
+        assert present(stranger) == frozenset()
         assert stranger_inbox.count == 0
 
 
@@ -418,7 +426,7 @@ def test_grounds_hear_each_other_and_a_robot_gets_their_world_whole() -> None:
             fleet="test", connect=[known], subscriptions={STATE: of_second}
         ) as second,
     ):  # fmt: skip
-        eventually(lambda: robot.peers() == 2 and first.present() == second.present() == {1})
+        eventually(lambda: robot.peers() == 2 and present(first) == present(second) == {1})
         eventually_hears(first, STATE, b"first", "ground/state", of_robot, of_second)
         eventually_hears(second, STATE, b"second", "ground/state", of_robot, of_first)
         assert of_second.newest["ground/state"] == b"first"
@@ -456,7 +464,7 @@ def test_whoever_floods_the_radio_costs_little_and_makes_nobody_deaf() -> None:
         assert inbox.count <= 1000 + from_one + lasted_s * 100
         assert all(len(data) <= 64 for data in inbox.newest.values())
         assert max(map(len, inbox.newest)) < 40
-        assert robot.failures() == 0
+        assert robot._failures.total() == 0
         # What zenoh itself refuses ends the stranger's connection, and nobody else's.
         eventually(partial(is_present, robot, {1}))
 
@@ -506,7 +514,7 @@ def test_close_twice_then_publish() -> None:
     link.close()
     link.publish(MESSAGE, b"late")
     assert link.peers() == 0
-    assert link.present() == frozenset()
+    assert present(link) == frozenset()
 
 
 def test_the_interpreter_exits_after_an_exception() -> None:
@@ -585,10 +593,10 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
             eventually(
                 lambda: not deaf(),
                 timeout_s,
-                why_not=lambda: {"deaf": deaf(), "before": before, "present": present()},
+                why_not=lambda: {"deaf": deaf(), "before": before, "present": visible()},
             )
 
-        def present() -> list[list[int]]:
+        def visible() -> list[list[int]]:
             return [seen["present"] for seen in near.seen() + far.seen()]
 
         def others(*teams: tuple[int, ...]) -> list[list[int]]:
@@ -600,15 +608,15 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
         pairs_apart = [*permutations(nearby, 2), *permutations(far_away, 2)]
         for _ in range(2):
             eventually_hear(all_pairs)
-            eventually(lambda: present() == everybody)
+            eventually(lambda: visible() == everybody)
             silence("add")
-            eventually(lambda: present() == apart)
+            eventually(lambda: visible() == apart)
             # Sooner than the 10 s for which a lost connection may hold a thread.
             eventually_hear(pairs_apart, timeout_s=5.0)
             silence("del")
         eventually_hear(all_pairs)
         silence("add")
-        eventually(lambda: present() == apart)
+        eventually(lambda: visible() == apart)
         for robots in (near, far):
             robots.process.communicate(timeout=8.0)
             assert robots.process.returncode == 0

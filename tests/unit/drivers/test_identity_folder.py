@@ -36,7 +36,7 @@ def test_a_member_is_who_the_authority_says(authority: Authority, tmp_path: Path
     assert identity.membership.start == 2_000_000_000_000
     assert load_identity(folder, fleet="demo", unix_s=5.0).membership.start == 2_000_000_000_001
     assert load_identity(folder, fleet="demo", unix_s=3e9).membership.start == 3_000_000_000_000
-    with pytest.raises(ConfigError, match="is robot r3's, not robot 4's"):
+    with pytest.raises(ConfigError, match="belongs to robot r3, not robot 4"):
         load_identity(folder, fleet="demo", unix_s=2e9, robot_id=4)
     # One that left starts as the robot that it is, as it may be in the air; nobody else does.
     authority.revoke("r3")
@@ -62,7 +62,7 @@ def test_a_running_program_takes_up_the_list_that_it_is_brought(
     authority: Authority, tmp_path: Path
 ) -> None:
     identity, guard = brought_a_new_list(authority, tmp_path)
-    identity.take_up(guard)
+    identity.update(guard)
     assert guard.members == authority.members
 
 
@@ -89,22 +89,22 @@ def test_a_list_that_cannot_be_used_changes_nothing_and_is_told_once(
     new_member(authority, folder, Role.ROBOT, "r3", 3)
     identity = load_identity(folder, fleet="demo", unix_s=2e9)
     guard, good = identity.guard(lambda: 0.0), (folder / MEMBERS).read_bytes()
-    identity.take_up(guard)
+    identity.update(guard)
     if text is None:
         (folder / MEMBERS).unlink()
     else:
         (folder / MEMBERS).write_bytes(text.replace(b"%b", good.split()[4]))
     capsys.readouterr()
     for _ in range(3):
-        identity.take_up(guard)
+        identity.update(guard)
     assert guard.members == authority.members
     told = capsys.readouterr()
-    assert (told.out + told.err).count("list of members not taken up") == 1
+    assert (told.out + told.err).count("identity not updated") == 1
     assert why in told.out + told.err
     # And is followed again, once it is whole.
     new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
     give_list(authority, folder)
-    identity.take_up(guard)
+    identity.update(guard)
     assert guard.members == authority.members
 
 
@@ -114,9 +114,9 @@ def test_a_list_that_could_not_be_read_once_is_read_again(
     identity, guard = brought_a_new_list(authority, tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(identity_folder, "read_members", _too_many_open_files)
-        identity.take_up(guard)
+        identity.update(guard)
     assert guard.members != authority.members
-    identity.take_up(guard)
+    identity.update(guard)
     assert guard.members == authority.members
 
 
@@ -132,7 +132,7 @@ def test_a_start_that_was_numbered_anew_stays_so_while_the_program_runs(
     new_member(authority, folder, Role.ROBOT, "r3", 3)
     identity = load_identity(folder, fleet="demo", unix_s=3e9)
     (folder / "start").write_text("2000000000000\n")
-    identity.take_up(identity.guard(lambda: 0.0))
+    identity.update(identity.guard(lambda: 0.0))
     again = load_identity(folder, fleet="demo", unix_s=2.000000001e9)
     assert again.membership.start == 2_000_000_001_000
 
@@ -147,10 +147,10 @@ def test_a_start_that_could_not_be_written_is_written_later_once(
     identity = load_identity(folder, fleet="demo", unix_s=2e9)
     guard = identity.guard(lambda: 0.0)
     with pytest.raises(OSError, match="start"):
-        identity.take_up(guard)
+        identity.update(guard)
     obstacle.rmdir()
     for text in ("2000000000000\n", "1000\n"):
-        identity.take_up(guard)
+        identity.update(guard)
         assert start.read_text() == text
         start.write_text("1000\n")
 
@@ -203,10 +203,10 @@ def test_in_flight_the_groups_key_that_is_spoken_stays(
         authority.revoke(leaves)
         write_file(folder / GROUP_KEYS, (authority.folder / GROUP_KEYS).read_bytes(), 0o600)
         give_list(authority, folder)
-        identity.take_up(guard, in_flight=True)
+        identity.update(guard, in_flight=True)
         assert identity.group_keys.sending == first == identity.group_keys.receiving[-1]
     assert len(identity.group_keys.receiving) == 3
-    identity.take_up(guard)
+    identity.update(guard)
     assert len(identity.group_keys.receiving) == 2 and first not in identity.group_keys.receiving
     assert identity.group_keys.sending == identity.group_keys.receiving[0]
 
@@ -217,7 +217,7 @@ def test_secrets_are_for_nobody_else(authority: Authority, tmp_path: Path) -> No
     for name in secrets:
         assert stat.S_IMODE((authority.folder / name).stat().st_mode) == 0o600
     (authority.folder / "key.pem").chmod(0o644)
-    with pytest.raises(ConfigError, match=r"key\.pem is readable for others: chmod 600"):
+    with pytest.raises(ConfigError, match=r"key\.pem is readable by others: chmod 600"):
         load_identity(authority.folder, fleet="demo", unix_s=2e9)
     (authority.folder / "authority.key").chmod(0o640)
     with pytest.raises(AuthorityError, match="chmod 600"):
@@ -231,7 +231,11 @@ def test_secrets_are_for_nobody_else(authority: Authority, tmp_path: Path) -> No
         ("members", b"[" * 100_000, r"members: does not begin with"),
         ("group-keys", b"xy", "hexadecimal"),
         ("key.pem", None, r"key\.pem is missing"),
-        ("key.pem", b"-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----", "no Ed25519"),
+        (
+            "key.pem",
+            b"-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----",
+            "not an Ed25519",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_one_line(
@@ -250,7 +254,7 @@ def test_what_cannot_be_used_is_one_line(
 
 def test_another_fleets_identity_is_refused(authority: Authority, tmp_path: Path) -> None:
     new_member(authority, authority.folder, Role.OPERATOR, "ann")
-    with pytest.raises(ConfigError, match="is of fleet 'demo', not of 'field'"):
+    with pytest.raises(ConfigError, match="belongs to fleet 'demo', not 'field'"):
         load_identity(authority.folder, fleet="field", unix_s=2e9)
     # A key that the list does not have.
     new_member(authority, tmp_path / "bob", Role.OPERATOR, "bob")
