@@ -24,6 +24,11 @@ _HEADING = re.compile(r"^#+ (.+)$", re.M)
 _CODE_BLOCK = re.compile(r"^```.*?^```", re.S | re.M)
 _GUIDE = ROOT / "docs" / "extending.md"
 _EXAMPLES = sorted((ROOT / "examples").rglob("*.py"))
+_LINKED = [
+    path.relative_to(ROOT).as_posix()
+    for pattern in ("examples/*.ipynb", "examples/*/README.md", "policies/*/README.md")
+    for path in sorted(ROOT.glob(pattern))
+]
 
 
 def anchors(page: str) -> set[str]:
@@ -35,7 +40,7 @@ def anchors(page: str) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("page", [*pages.hand_written(), *pages.generated()])
+@pytest.mark.parametrize("page", [*pages.hand_written(), *pages.generated(), *_LINKED])
 def test_links_lead_somewhere(page: str) -> None:
     for link in pages.links(pages.page_text(page)):
         path, _, anchor = link.partition("#")
