@@ -1,4 +1,4 @@
-"""Lateness of control while nobody, an outsider and a member flood the radio."""
+"""Lateness of control while nobody, an outsider and members flood the radio."""
 
 import itertools
 import json
@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -15,8 +16,8 @@ import zenoh
 
 from bench import BUNDLE
 from bench.result import Result, Table, Target, progress
-from edge.drivers.identity_folder import receiving_identity
-from edge.messages.topics import TlsFiles
+from edge.drivers.identity_folder import load_identity
+from edge.messages.topics import MESSAGE, TlsFiles
 from lpac.sim.engines import require_flown
 from lpac.sim.fleet.flight import FleetMoment, fly_programs
 from lpac.sim.fleet.processes import Fleet
@@ -26,13 +27,14 @@ RATE_HZ = 10_000
 # Each message in its turn: of one robot, of the ground, and of names that nobody has.
 _OUTSIDERS = ("robot/2/message", "ground/state", *(f"robot/{id_}/message" for id_ in range(9, 109)))
 _MEMBERS = ("robot/2/message",)
+_WHO = ("nobody", "an outsider", "a member", "a member who signs")
 _STEP_S = 0.01
 
 
 def measure(robots: int = 3, mission_s: float = 60.0) -> Result:
-    """Fly three missions of `robots` robots; who is a member floods with robot 2's certificate."""
+    """Fly a mission of `robots` robots for each; members flood with what robot 2 has."""
     rows, p99_ms = [], {}
-    for who in ("nobody", "an outsider", "a member"):
+    for who in _WHO:
         progress(f"flood: {robots} robots fly, {who} floods, about two minutes")
         late_ms, rate_hz = _fly(who, robots, mission_s)
         p99_ms[who] = max(late_ms)
@@ -49,7 +51,7 @@ def measure(robots: int = 3, mission_s: float = 60.0) -> Result:
         ],
         [
             Target(f"control is late, p99 ms, {who} floods", p99_ms[who], 20, at_least=False)
-            for who in ("an outsider", "a member")
+            for who in _WHO[1:]
         ],
         ["Every message goes to every robot. Vehicles, operator and flood share the cores."],
     )
@@ -75,11 +77,13 @@ def _fly(who: str, robots: int, mission_s: float) -> tuple[list[float], float]:
             lasted_s = time.monotonic() - began_s
 
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        scenario = Scenario(robots=robots, seed=7, duration_s=mission_s, secure=who == "a member")
+        scenario = Scenario(robots=robots, seed=7, duration_s=mission_s, secure=who in _WHO[2:])
         fleet = Fleet(scenario, Path(folder), BUNDLE)
-        keys = fleet.robots[2].folder / "identity" if who == "a member" else None
+        keys = fleet.robots[2].folder / "identity" if scenario.secure else None
         flood = spawning.Process(
-            target=_flood, args=(fleet.name, fleet.endpoints, keys, over, sent), daemon=True
+            target=_flood,
+            args=(fleet.name, fleet.endpoints, keys, who == _WHO[3], over, sent),
+            daemon=True,
         )
         stack.callback(over.set)
         flight = fly_programs(fleet, watch=watch)
@@ -91,18 +95,24 @@ def _flood(
     fleet: str,
     endpoints: tuple[str, ...],
     keys: Path | None,
+    signs: bool,
     over: Event,
     sent: "Synchronized[int]",
 ) -> None:
     """Publish `RATE_HZ` messages a second until `over`, with the keys in that folder, if any."""
-    tls = None if keys is None else certified(receiving_identity(keys, fleet=fleet).tls)
+    data, tls = partial(bytes, 100), None
+    if keys is not None:
+        identity = load_identity(keys, fleet=fleet, unix_s=time.time())
+        tls = certified(identity.tls)
+        if signs:
+            data = partial(identity.guard(time.monotonic).seal, MESSAGE, bytes(100))
     names = itertools.cycle(_OUTSIDERS if keys is None else _MEMBERS)
     began_s, count = time.monotonic(), 0
     with unruly_session(endpoints, tls) as session:
         while not over.wait(_STEP_S):
             due = int((time.monotonic() - began_s) * RATE_HZ)
             for name in itertools.islice(names, due - count):
-                session.put(f"lpac/{fleet}/{name}", bytes(100))
+                session.put(f"lpac/{fleet}/{name}", data())
             count = sent.value = due
 
 
