@@ -48,7 +48,7 @@ from edge.messages.bounds import (
 from edge.messages.codes import FailedCheck, Reason, ReasonCode, Refusal
 
 ORDER_LIFETIME_S = 10.0
-# Stations repeat a hold every 0.4 s.
+# Stations repeat a hold five times a second.
 HOLD_LASTS_S = 1.5
 Heading = Annotated[float, Meta(ge=0.0, lt=360.0)]
 SlotNumber = Annotated[int, Meta(ge=0, le=1000)]

@@ -214,14 +214,13 @@ class GroundNode:
         if self._link is None:
             return
         due = now_s - self._state_at_s > 1.0 / STATE.rate_hz - _EARLY_S
-        if due or self._published != before:
-            state, hold = station.published_state(), station.published_hold
+        if due or self._published != before or station.is_heard_late():
+            state = station.published_state()
             if state is not None:
                 self._link.publish(STATE, encode(state))
-            if hold is not None:
-                self._link.publish(HOLD, encode(hold))
-            if state is not None or hold is not None:
                 self._state_at_s = now_s
+        if station.published_hold is not None:
+            self._link.publish(HOLD, encode(station.published_hold))
         for order in station.orders.pending:
             self._link.publish(ORDER, encode(order))
         world = station.published_world()

@@ -45,6 +45,9 @@ _LATELY_S = 10.0
 _EVENTS_KEPT = 200
 # A hold is repeated at least so long, if robots hold and the commander's state does not have it.
 _ASKED_AT_LEAST_S = 3.0
+# Age of the last state that a robot heard, its status's included: beyond the first it has missed
+# one, beyond the second it is out of reach.
+_LATE_S, _LOST_S = 1.0, 5.0
 
 
 def is_down(status: RobotStatus) -> bool:
@@ -325,6 +328,14 @@ class Station:
             time_base=self._time_base,
             time_s=self.now_s,
             echoes=self._echoes.take(),
+        )
+
+    def is_heard_late(self) -> bool:
+        """Whether a robot seems to miss states, which then go out at each tick."""
+        lasts = filter(None, map(self._robots.last, self._robots.statuses()))
+        return any(
+            status.ground_age_s is not None and _LATE_S < status.ground_age_s + age_s < _LOST_S
+            for status, age_s in lasts
         )
 
     def published_world(self) -> str | None:

@@ -540,7 +540,7 @@ def test_all_programs_of_one_robot_are_killed() -> None:
 
 
 def test_two_programs_of_one_robot_settle_nothing() -> None:
-    field = a_field(3, "ready", seed=5)
+    field = a_field(3, "ready", seed=6)
     field.air = replace(field.air, loss=0.1)
     field.second_program(1)
     field.run(10.0)
