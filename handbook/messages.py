@@ -67,9 +67,10 @@ def page() -> str:
                     for topic in topics.TOPICS
                 ],
             ),
-            "Beacon and policy's message are binary. All others are JSON with the fields below, "
-            "each message in one signed envelope. Fields with a default are optional, and unknown "
-            "fields are ignored.",
+            "Beacon and policy's message are binary. All others are raw deflate streams "
+            "(RFC 1951): `explored` of bits, `world` of the file's text, the rest of JSON with the "
+            "fields below. Each is in one signed envelope. Fields with a default are optional, and "
+            "unknown fields are ignored.",
             "## Messages",
             *(part for message in MESSAGES for part in _message(message)),
             "## Layouts in bytes",
