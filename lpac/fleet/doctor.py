@@ -236,7 +236,7 @@ async def _check_vehicle(
 
 @dataclass(frozen=True, slots=True)
 class _Context:
-    """What a check may use: the robot, its examination, and all facts by robot name."""
+    """Input of a check: the robot, its examination, and all facts by robot name."""
 
     config: FleetConfig
     robot: RobotHost

@@ -166,7 +166,7 @@ def check_identity(
 def wrong_identity(
     identity: dict[str, object] | None, config: FleetConfig, robot: RobotHost
 ) -> tuple[str, str] | None:
-    """Which other robot answers, and what to do; None if the right one answers."""
+    """Other robot that answers at the address, and the remedy; None if the right one answers."""
     if identity is None:
         return "it is not enrolled", f"run `lpac fleet enroll {robot.name} {robot.host}` once"
     other = other_identity(identity, config, robot)

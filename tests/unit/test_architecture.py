@@ -251,3 +251,16 @@ def test_what_runs_on_the_robots_own_python_is_one_file() -> None:
     assert len((ROOT / "lpac" / "fleet" / "agent.py").read_text().splitlines()) <= 500
     text = (ROOT / "lpac" / "fleet" / "session.py").read_text()
     assert "modules = (raw_mavlink, agent)" in text
+
+
+def test_docstrings_open_with_an_imperative_or_a_noun() -> None:
+    """Relative clauses name neither the thing nor its action."""
+    openings = {"That", "What", "Where", "Which", "Who", "Whom", "Whose"}
+    wrong = []
+    for path in (*sources(), *(ROOT / "bench").rglob("*.py"), *(ROOT / "handbook").rglob("*.py")):
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                text = ast.get_docstring(node)
+                if text and text.split(None, 1)[0].rstrip(",:;.") in openings:
+                    wrong.append(f"{path.relative_to(ROOT)}: {text.splitlines()[0]}")
+    assert not wrong, "\n".join(wrong)
