@@ -2,7 +2,8 @@
 
 import math
 import sys
-from itertools import groupby
+from collections.abc import Sequence
+from itertools import groupby, takewhile
 
 from edge.flight.margins import ErrorBudget
 from handbook.markdown import cell, table
@@ -12,30 +13,55 @@ from lpac.sim.drill.bounds import (
     POSITION_ERROR_M,
     TOUCHDOWN_M_S,
     Bound,
+    Criterion,
     FewCommands,
     RobotGroup,
     always,
 )
-from lpac.sim.drill.faults import FAULTS, Fault
+from lpac.sim.drill.faults import ADRIFT, ADRIFT_M, FAULTS, SHARED_BOUNDS, Fault
 from lpac.sim.engines import flies
+
+# Names of figures, shorter than in a report; the sign tells a lower limit from an upper one.
+_SHORT = {
+    "share of the mission": "mission",
+    "last of the mission": "ends",
+    "leaves the mission": "left",
+    "lands no sooner": "lands",
+    "speed at rest": "rests",
+    "greatest speed": "speed",
+    "from where it held": "strays",
+    "leaves its height": "height",
+    "drift while it lands": "drift",
+    "from its pad": "pad",
+    "landed apart": "apart",
+    "flies at least": "flies",
+    "flown beyond the fence": "flown outside",
+    "setpoints after the lapse": "setpoints",
+}
 
 
 def tables() -> dict[str, str]:
     """The drill's tables as Markdown, by topic."""
-    faults = [
+    shared = ((f"`{name}`", _text(bounds)) for name, bounds in SHARED_BOUNDS.items())
+    adrift = f"outside ≤{ADRIFT_M:.3g}; not covered: {ADRIFT}"
+    faults = (
         (
-            fault.name,
-            cell(fault.what),
-            cell(fault.promise + (f" (not covered: {fault.uncovered})" if fault.uncovered else "")),
+            " ".join(filter(None, (fault.name, _engines(fault)))),
+            f"{cell(fault.what)}<br>*{cell(fault.promise)}*",
             _bounds(fault),
-            *("yes" if flies(engine, fault) else "" for engine in ("mavlink", "px4")),
         )
         for fault in FAULTS.values()
-    ]
+    )
     return {
         "every flight": table(("in every flight", "limit"), _of_every_flight()),
-        "faults": table(("fault", "what happens", "promise", "bounds", "mavlink", "px4"), faults),
+        "shared": table(("code", "bounds"), (*shared, ("`adrift`", adrift))),
+        "faults": table(("fault", "what happens, *promise*", "bounds"), faults),
     }
+
+
+def _engines(fault: Fault) -> str:
+    """M and P for the engines mavlink and px4, if they fly it."""
+    return "M" * flies("mavlink", fault) + "P" * flies("px4", fault)
 
 
 def _of_every_flight() -> list[tuple[str, str]]:
@@ -43,46 +69,80 @@ def _of_every_flight() -> list[tuple[str, str]]:
     few = (each for each in always(0.0, "all") if isinstance(each, FewCommands))
     commands = " and ".join(f"{each.limit:g} within {each.within_s:g} s" for each in few)
     return [
-        ("distance between two vehicles, unless both stand", f"≥ {budget.drone_m:g} m, their size"),
-        ("distance beyond the fence, without a pilot", f"≤ {POSITION_ERROR_M:g} m"),
-        ("height above the fence's ceiling, without a pilot", f"≤ {budget.height_m:g} m"),
-        ("motors started without a fresh takeoff order to that robot, or twice by one", "none"),
-        ("height at which motors stop, without a kill order", f"≤ {FALLS_M:g} m"),
-        ("speed at touchdown, without a kill order", f"≤ {TOUCHDOWN_M_S:g} m/s"),
-        ("last setpoint to a vehicle after a pilot took it", f"≤ {PILOT_NOTICED_S:g} s"),
-        ("commands to a simulated vehicle, requests included", f"≤ {commands}"),
-        ("vehicles in the air or armed at the end", "none"),
+        ("between two vehicles, unless both stand", f"≥{budget.drone_m:g} m, their size"),
+        ("beyond the fence, without a pilot", f"≤{POSITION_ERROR_M:g} m"),
+        ("above the ceiling, without a pilot", f"≤{budget.height_m:g} m"),
+        ("motors started without a fresh takeoff order, or twice by one", "none"),
+        ("motors stop, without a kill order, at", f"≤{FALLS_M:g} m"),
+        ("touchdown, without a kill order, at", f"≤{TOUCHDOWN_M_S:g} m/s"),
+        ("last setpoint after a pilot took it", f"≤{PILOT_NOTICED_S:g} s"),
+        ("commands to a simulated vehicle", f"≤{commands}"),
+        ("in the air or armed at the end", "none"),
         ("moments without a known true position", "none"),
     ]
 
 
 def _bounds(fault: Fault) -> str:
-    """Such as "lands ≤ 1.3 s; down ≤ 45 s", with a line per group of robots."""
-    bounds = [each for each in fault.bounds if isinstance(each, Bound)]
-    assert len(bounds) == len(fault.bounds)
-    lines = [
-        _group(robots) + "; ".join(map(_bound, group))
-        for robots, group in groupby(bounds, lambda bound: bound.robots)
-    ]
-    if fault.beyond_fence_m != POSITION_ERROR_M:
-        lines.append(f"{_group(fault.carried)}beyond the fence ≤ {fault.beyond_fence_m:.3g} m")
-    return "<br>".join(lines)
+    """Such as "`others-fly`; lands ≤1.3", shared bounds by their codes."""
+    parts: list[str] = []
+    rest = fault.bounds
+    while rest:
+        found = (name for name, shared in SHARED_BOUNDS.items() if rest[: len(shared)] == shared)
+        name = next(found, None)
+        count = len(SHARED_BOUNDS[name]) if name else _alike(rest)
+        parts.append(f"`{name}`" if name else _text(rest[:count]))
+        rest = rest[count:]
+    adrift = fault.uncovered == ADRIFT and fault.beyond_fence_m == ADRIFT_M
+    if adrift:
+        parts.append("`adrift`")
+    elif fault.beyond_fence_m != POSITION_ERROR_M:
+        parts.append(f"{_group(fault.carried)}outside ≤{fault.beyond_fence_m:.3g}")
+    if fault.uncovered and not adrift:
+        parts.append(f"not covered: {cell(fault.uncovered)}")
+    return _join(parts)
+
+
+def _alike(bounds: tuple[Criterion, ...]) -> int:
+    """Count the first bounds that are of one group and have no code."""
+    robots = _bound(bounds[0]).robots
+    shared = {group[0] for group in SHARED_BOUNDS.values() if len(group) == 1}
+    same = takewhile(lambda each: _bound(each).robots == robots and each not in shared, bounds)
+    return sum(1 for _ in same)
+
+
+def _text(bounds: tuple[Criterion, ...]) -> str:
+    """Such as "lands ≤1.3; down ≤45<br>others: pad ≤3"."""
+    groups = groupby(map(_bound, bounds), lambda bound: bound.robots)
+    return _join([_group(robots) + "; ".join(map(_bound_text, group)) for robots, group in groups])
+
+
+def _join(parts: Sequence[str]) -> str:
+    """Join parts; one that names its robots is a line of its own."""
+    text, named = "", False
+    for part in parts:
+        starts_line = named or ": " in part
+        text += ("<br>" if starts_line else "; ") * bool(text) + part
+        named = ": " in part
+    return text
 
 
 def _group(robots: RobotGroup) -> str:
     return "" if robots == "hit" else f"{robots}: "
 
 
-def _bound(bound: Bound) -> str:
+def _bound(criterion: Criterion) -> Bound:
+    assert isinstance(criterion, Bound)
+    return criterion
+
+
+def _bound_text(bound: Bound) -> str:
     sign = "≥" if type(bound).worst is min else "≤"
-    limit = f"{bound.told_as} {sign} {bound.limit:.3g} {bound.unit}".rstrip()
-    window = (
-        f"from {bound.from_s:g} s" if 0.0 < bound.from_s < math.inf else "",
-        f"to {bound.until_s:g} s" if bound.until_s < math.inf else "",
-        f'after "{bound.after}"' if bound.after else "",
-    )
-    when = " ".join(filter(None, window))
-    return f"{limit} ({when})" if when else limit
+    limit = f"{_SHORT.get(bound.told_as, bound.told_as)} {sign}{bound.limit:.3g}"
+    begins, ends = max(bound.from_s, 0.0), bound.until_s
+    window = ""
+    if begins or ends < math.inf:
+        window = f" [{begins:g}-{ends:g}]" if ends < math.inf else f" [{begins:g}-]"
+    return limit + window + (f" after {bound.after}" if bound.after else "")
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ EVER = math.inf
 _DESCENT_S = 20.0 / 0.7
 # Without GPS nothing holds a place any more, and the wind has it all the way down.
 ADRIFT_M = POSITION_ERROR_M + GREATEST_WIND_M_S * _DESCENT_S
-_ADRIFT = "without a position the wind carries it as it comes down, over the fence or onto another"
+ADRIFT = "without a position the wind carries it as it comes down, over the fence or onto another"
 # A storm, and the greatest wind besides, carry a vehicle as fast as they blow beyond its airspeed,
 # and until it has stopped: no margin covers that.
 _STORM_M_S, _STORM_S = 16.0, 10.0
@@ -106,8 +106,9 @@ _ALL_DOWN = Down(14.0 + _LANDING_S, "all")
 class Fault:
     """A fault of a fleet: injections and their times, and the bounds of a flight with it.
 
-    `what` and `promise` are for people. The fault begins in the `phase`, at a time drawn by the
-    seed, and hits that many robots, drawn too (0: the whole fleet). The operator watches for
+    `what` and `promise` are for people, and of one robot unless they say otherwise. The fault
+    begins in the `phase`, at a time drawn by the seed, and hits that many robots, drawn too (0: the
+    whole fleet). The operator watches for
     `watched_s`, and then brings all home, unless `home` is False. With `exact` robots know their
     positions. `settings` are further keys of robot.toml. By its nature the fault may carry the
     `carried` group so far beyond the fence. `uncovered` says what no margin and no check prevents.
@@ -158,13 +159,13 @@ _FAULTS = (
     ),
     # Programs
     Fault(
-        "program-dies", "a robot's program dies (kill -9, crash)",
-        "PX4 lands the vehicle where it is, 1 s after its last setpoint",
+        "program-dies", "program dies (kill -9, crash)",
+        "PX4 lands it in place, 1 s after its last setpoint",
         does=(Do(do.RobotProgram("dies")),), bounds=_PX4_LANDS_IT,
     ),
     Fault(
-        "program-hangs", "a robot's program stands still (SIGSTOP, the interpreter held)",
-        "the watchdog has PX4 hold after 0.5 s; it lands 60 s later",
+        "program-hangs", "program hangs (SIGSTOP)",
+        "watchdog has PX4 hold after 0.5 s; lands 60 s later",
         does=(Do(do.ProgramStops(EVER)),),
         bounds=(
             _HOLDS, Stands(from_s=_STANDS_AFTER_S, until_s=55.0), NotLandedBefore(55.0),
@@ -173,8 +174,8 @@ _FAULTS = (
         watched_s=75.0,
     ),
     Fault(
-        "program-goes-on", "a stopped program is continued after 5 s (SIGCONT)",
-        "nothing is sent for 2 s; it holds where the vehicle is, until start is ordered",
+        "program-goes-on", "stopped program continues after 5 s (SIGCONT)",
+        "sends nothing for 2 s; holds until start",
         does=(Do(do.ProgramStops(5.0)), Do(do.OperatorOrders("start"), 20.0, mark="start")),
         bounds=(
             _HOLDS, MissionEnds(0.6, until_s=19.9), SentNothing(from_s=0.3, until_s=6.9),
@@ -184,8 +185,8 @@ _FAULTS = (
         watched_s=35.0,
     ),
     Fault(
-        "control-hangs", "the control loop alone hangs, for 3 s",
-        "the watchdog has PX4 hold after 0.5 s; the robot holds until start is ordered",
+        "control-hangs", "control loop hangs for 3 s",
+        "watchdog has PX4 hold after 0.5 s; holds until start",
         does=(Do(do.LoopHangs("control", 3.0)),),
         bounds=(
             _HOLDS, MissionEnds(0.6), SentNothing(from_s=0.3, until_s=4.9), _STANDS,
@@ -193,8 +194,8 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "left-alone", "the control loop hangs for 3 s, and nobody answers",
-        "the robot lands where it is after 60 s",
+        "left-alone", "control loop hangs for 3 s, nobody answers",
+        "lands in place after 60 s",
         does=(Do(do.LoopHangs("control", 3.0)),),
         bounds=(
             _HOLDS, MissionEnds(0.6), Stands(from_s=_STANDS_AFTER_S, until_s=60.0),
@@ -203,14 +204,14 @@ _FAULTS = (
         watched_s=70.0,
     ),
     Fault(
-        "watchdog-dies-too", "a program stands still, and its watchdog is dead",
-        "PX4 lands 1 s after the last setpoint",
+        "watchdog-dies-too", "program hangs, watchdog dead",
+        "PX4 lands it 1 s after the last setpoint",
         does=(Do(do.RobotProgram("loses its watchdog")), Do(do.ProgramStops(EVER))),
         bounds=_PX4_LANDS_IT,
     ),
     Fault(
-        "program-restarts", "a program hangs for 3 s, and systemd starts it again",
-        "the new one only observes; the vehicle stays in hold and lands 60 s later",
+        "program-restarts", "program hangs for 3 s; systemd restarts it",
+        "only observes; vehicle holds, lands 60 s later",
         does=(Do(do.ProgramStops(EVER)), Do(do.RobotProgram("starts"), 3.5)),
         bounds=(
             _HOLDS, Stands(from_s=_STANDS_AFTER_S, until_s=59.0), NotLandedBefore(55.0),
@@ -219,14 +220,14 @@ _FAULTS = (
         watched_s=80.0,
     ),
     Fault(
-        "program-restarts-at-once", "a program dies, and starts again 0.5 s later",
-        "it only observes: PX4 lands, as it would without",
+        "program-restarts-at-once", "program dies, restarts 0.5 s later",
+        "only observes: PX4 lands it",
         does=(Do(do.RobotProgram("dies")), Do(do.RobotProgram("starts"), 0.5)),
         bounds=(Lands(1.3), _DOWN, _OTHERS_FLY_ON),
     ),
     Fault(
-        "policy-dies", "a robot's policy stops answering",
-        "the robot holds within 1 s, until start is ordered, which is refused",
+        "policy-dies", "policy stops answering",
+        "holds within 1 s, until start, which is refused",
         does=(Do(do.LoopHangs("policy", EVER)), Do(do.OperatorOrders("start"), 8.0)),
         bounds=(
             MissionEnds(1.3), Stands(from_s=4.0, until_s=20.0), NotLandedBefore(20.0),
@@ -234,8 +235,8 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "sensor-dies", "a robot's perception stops",
-        "the robot holds within 2 s",
+        "sensor-dies", "perception stops",
+        "holds within 2 s",
         does=(Do(do.LoopHangs("perception", EVER)),),
         bounds=(
             MissionEnds(2.3), Stands(from_s=5.0, until_s=20.0), NotLandedBefore(20.0),
@@ -243,92 +244,91 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "autopilot-silent", "the wire between a robot's computer and its autopilot is cut",
-        "PX4 lands 1 s after the last setpoint that reached it",
+        "autopilot-silent", "wire between computer and autopilot cut",
+        "PX4 lands it 1 s after the last setpoint it got",
         does=(Do(do.disturb_wire(MavlinkWire(loss=1.0))),), bounds=_PX4_LANDS_IT,
     ),
     Fault(
-        "disk-fills", "all robots' disks are full in flight",
-        "an alarm; the mission goes on",
+        "disk-fills", "all disks full in flight",
+        "alarm; flies on",
         does=(Do(do.DiskFills()),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "clock-steps", "a robot's wall clock steps by an hour",
-        _NOTHING,
+        "clock-steps", "wall clock steps by an hour",
+        "flies on",
         does=(Do(do.ClockSteps(3600.0)),), bounds=_MISSION_GOES_ON,
     ),
     Fault(
-        "clocks-step", "all robots' wall clocks step back by an hour, the laptop's ahead",
-        _NOTHING,
+        "clocks-step", "robots' wall clocks an hour back, laptop's ahead",
+        "all fly on",
         does=(Do(do.ClockSteps(-3600.0)), Do(do.GroundClockSteps(3600.0))), bounds=_MISSION_GOES_ON,
         hits=0,
     ),
     Fault(
-        "second-program", "another computer claims to be one of the robots",
-        "that one does not take off",
+        "second-program", "another computer claims a robot's id",
+        "that robot does not take off",
         does=(Do(do.SecondProgram()),), bounds=_ONE_STAYS_DOWN, phase="ready",
     ),
     Fault(
-        "program-ends", "a robot's program is stopped in flight, and on_stop = land",
-        "it has PX4 land the vehicle where it is, and ends",
+        "program-ends", "program stopped in flight, on_stop = land",
+        "has PX4 land in place, ends",
         # Sooner than PX4 misses its setpoints.
         does=(Do(do.RobotProgram("ends")),),
         bounds=(Lands(0.9), _STRAIGHT_DOWN, _DOWN, _OTHERS_FLY_ON),
     ),
     Fault(
-        "program-dies-in-takeoff", "a robot's program dies while it climbs",
-        "PX4 lands it where it is",
+        "program-dies-in-takeoff", "program dies in the climb",
+        "PX4 lands it in place",
         does=(Do(do.RobotProgram("dies"), 9.0),), bounds=(_OTHERS_TAKE_OFF, Down(9.0 + _LANDING_S)),
         phase="takeoff",
     ),
     # The wire to the autopilot
     *(
         Fault(
-            f"link-loses-{percent}", f"{percent} % of all MAVLink messages are lost, either way",
-            "the mission goes on, with an alarm that names the share",
+            f"link-loses-{percent}", f"{percent} % of MAVLink messages lost, either way",
+            "alarm names the share; flies on",
             does=(Do(do.disturb_wire(MavlinkWire(loss=percent / 100.0))),), bounds=_MISSION_GOES_ON,
             hits=0,
         )
         for percent in (5, 10, 20, 30)
     ),
     Fault(
-        "link-loses-30-before", "30 % of all MAVLink messages are lost, from before takeoff on",
-        "a takeoff may have to be ordered again; robots that take off fly and come home",
+        "link-loses-30-before", "30 % of MAVLink messages lost from before takeoff",
+        "takeoff may need a second order; those that fly come home",
         does=(Do(do.disturb_wire(MavlinkWire(loss=0.3))),), bounds=(_ALL_HOME,), phase="ready",
         hits=0, watched_s=60.0,
     ),
     Fault(
-        "link-repeats", "MAVLink messages come twice, one of them 60 to 110 ms late",
-        "the mission goes on, with an alarm that says so",
+        "link-repeats", "MAVLink messages doubled, one 60 to 110 ms late",
+        "alarm; flies on",
         does=(Do(do.disturb_wire(MavlinkWire(twice=1.0))),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "link-repeats-late", "MAVLink messages come twice, one of them 2 s late",
-        "the mission goes on, with an alarm that says so",
+        "link-repeats-late", "MAVLink messages doubled, one 2 s late",
+        "alarm; flies on",
         does=(Do(do.disturb_wire(MavlinkWire(twice=1.0, late_s=(1.9, 2.1)))),),
         bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "link-reorders", "one in five MAVLink messages is 60 to 110 ms late, and overtaken",
-        "it counts as lost; the mission goes on",
+        "link-reorders", "one in five MAVLink messages overtaken, 60 to 110 ms late",
+        "late counts as lost; flies on",
         does=(Do(do.disturb_wire(MavlinkWire(late=0.2))),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     # Radio and ground
     Fault(
-        "neighbours-silent", "robots hear the ground, but not each other",
-        "they are forgotten after 0.8 s; the mission goes on",
+        "neighbours-silent", "robots hear the ground, not each other",
+        "forgotten after 0.8 s; all fly on",
         does=(Do(do.RadioCut("from each other")),), bounds=(_ALL_FLY_ON,), hits=0,
     ),
     Fault(
-        "neighbours-silent-before",
-        "robots hear the ground, but not each other, before takeoff",
-        "nobody takes off: they would not keep apart",
+        "neighbours-silent-before", "robots do not hear each other before takeoff",
+        "nobody takes off",
         does=(Do(do.RadioCut("from each other")),), bounds=(StaysDown(robots="all"),),
         phase="ready", hits=0, home=False,
     ),
     Fault(
-        "ground-lost", "robots and ground do not hear each other for 10 s",
-        "they hold after 3 s, and until start is ordered",
+        "ground-lost", "robots and ground hear nothing of each other for 10 s",
+        "hold after 3 s, until start",
         does=(Do(do.RadioCut("from the ground")), Do(do.RadioCut("none"), 10.0)),
         bounds=(
             _ALL_STOP, Stands(robots="all", from_s=7.0, until_s=25.0, may_part=True),
@@ -338,15 +338,15 @@ _FAULTS = (
         hits=0, watched_s=25.0,
     ),
     Fault(
-        "ground-lost-for-good", "the ground is never heard again",
-        "hold after 3 s, land where they are after 13 s",
+        "ground-lost-for-good", "ground lost for good",
+        "hold after 3 s; land in place after 13 s",
         does=(Do(do.RadioCut("from the ground")),),
         bounds=(*_ALL_WAIT_AND_LAND, StraightDown(3.0, "all"), LandApart(), _ALL_DOWN), hits=0,
         watched_s=30.0, home=False,
     ),
     Fault(
-        "radio-dies", "an access point that never comes back: nobody hears anybody",
-        "hold after 3 s, land where they are after 13 s",
+        "radio-dies", "nobody hears anybody again",
+        "hold after 3 s; land in place after 13 s",
         does=(Do(do.RadioCut("all")),),
         bounds=(
             _ALL_STOP, Stands(robots="all", from_s=7.0, until_s=12.5), NotLandedBefore(12.5, "all"),
@@ -355,8 +355,8 @@ _FAULTS = (
         hits=0, watched_s=30.0, home=False,
     ),
     Fault(
-        "radio-silent", "all radios are silent at once, for 8 s",
-        "they hold after 3 s, and until start is ordered",
+        "radio-silent", "all radios silent for 8 s",
+        "hold after 3 s, until start",
         does=(
             Do(do.RadioCut("all")), Do(do.RadioCut("none"), 8.0),
             Do(do.OperatorOrders("start"), 15.0, "all", "start"),
@@ -368,8 +368,8 @@ _FAULTS = (
         hits=0, watched_s=35.0,
     ),
     Fault(
-        "cut-in-halves", "the swarm is cut in halves for 20 s, the ground with the first",
-        "the first half flies on; the second holds after 3 s, and lands after 13 s",
+        "cut-in-halves", "swarm cut in halves for 20 s, ground with the first",
+        "first flies on; second holds after 3 s, lands after 13 s",
         does=(Do(do.RadioCut("in halves")), Do(do.RadioCut("none"), 20.0)),
         bounds=(
             FliesOn(0.95, "first half", until_s=20.0),
@@ -382,46 +382,46 @@ _FAULTS = (
         hits=0, watched_s=40.0,
     ),
     Fault(
-        "radio-loses-half", "every other message is lost",
-        "the mission goes on",
+        "radio-loses-half", "half of all messages lost",
+        "all fly on",
         does=(Do(do.RadioIs(loss=0.5)),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "radio-late", "all messages come 3 s late, 1.5 to 4.5 s",
-        "a robot without a message from the ground younger than 3 s holds; none lands",
+        "radio-late", "messages 1.5 to 4.5 s late",
+        "hold without a ground message younger than 3 s; none lands",
         does=(Do(do.RadioIs(delay_s=3.0)),), bounds=(NotLandedBefore(30.0, "all"), _ALL_HOME),
         hits=0, watched_s=30.0,
     ),
     Fault(
-        "radio-very-late", "all messages come 8 s late, 4 to 12 s",
-        "a late ground is a lost one: hold after 3 s; it still lands them",
+        "radio-very-late", "messages 4 to 12 s late",
+        "hold after 3 s; land after 13 s",
         does=(Do(do.RadioIs(delay_s=8.0)),), bounds=_ALL_WAIT_AND_LAND, hits=0, watched_s=30.0,
     ),
     Fault(
-        "radio-repeats", "all messages come twice, and overtake each other",
-        "the mission goes on",
+        "radio-repeats", "messages doubled and out of order",
+        "all fly on",
         does=(Do(do.RadioIs(duplication=1.0, delay_s=0.4)),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "radio-corrupts", "every other message arrives with a flipped bit",
-        "it is dropped; the mission goes on",
+        "radio-corrupts", "a bit flipped in half of all messages",
+        "dropped; all fly on",
         does=(Do(do.RadioIs(corruption=0.5)),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "ground-sleeps", "the operator's laptop sleeps for 60 s",
-        "hold after 3 s, land where they are after 13 s; they stay down when it wakes",
+        "ground-sleeps", "laptop sleeps for 60 s",
+        "hold after 3 s; land in place after 13 s, stay down",
         does=(Do(do.GroundStops(60.0)),), bounds=(*_ALL_WAIT_AND_LAND, LandApart(), _ALL_DOWN),
         hits=0, watched_s=70.0,
     ),
     Fault(
-        "ground-dies", "the operator's laptop is gone",
-        "hold after 3 s, land where they are after 13 s",
+        "ground-dies", "laptop gone",
+        "hold after 3 s; land in place after 13 s",
         does=(Do(do.Laptop("dies")),), bounds=(*_ALL_WAIT_AND_LAND, LandApart(), _ALL_DOWN),
         hits=0, watched_s=30.0, home=False,
     ),
     Fault(
-        "ground-restarts", "the operator's laptop is gone, and back after 6 s",
-        "hold after 3 s, and until start is ordered",
+        "ground-restarts", "laptop gone, back after 6 s",
+        "hold after 3 s, until start",
         does=(
             Do(do.Laptop("dies")), Do(do.Laptop("starts"), 6.0),
             Do(do.OperatorOrders("start"), 16.0, "all", "start"),
@@ -433,28 +433,28 @@ _FAULTS = (
         hits=0, watched_s=36.0,
     ),
     Fault(
-        "ground-dies-in-takeoff", "the operator's laptop is gone while they climb",
-        "the takeoff goes on meanwhile; they land where they are after 13 s",
+        "ground-dies-in-takeoff", "laptop gone in the climb",
+        "climb on; land in place after 13 s",
         does=(Do(do.Laptop("dies"), 12.0, mark="gone"),),
         bounds=(Lands(14.5, "all", after="gone"), Down(12.0 + 14.5 + _LANDING_S, "all")),
         phase="takeoff", hits=0, watched_s=30.0, home=False,
     ),
     Fault(
-        "ground-dies-in-return", "the operator's laptop is gone on the way home",
-        "a robot on its way holds after 3 s, lands after 13 s; one that lands goes on",
+        "ground-dies-in-return", "laptop gone on the way home",
+        "hold after 3 s, land after 13 s; a landing goes on",
         does=(Do(do.Laptop("dies")),), bounds=(Lands(14.0, "all"), _ALL_DOWN), phase="return",
         hits=0, watched_s=30.0, home=False,
     ),
     # Positions
     Fault(
-        "gps-lost", "a robot's receiver loses its fix",
-        "it stands within 1.1 s, and lands 2.4 s after the loss; it drifts from 5 s on",
+        "gps-lost", "no fix",
+        "stands within 1.1 s, lands after 2.4 s, drifts from 5 s on",
         does=(Do(do.lose_gps()),), bounds=(_BRAKED, Lands(3.3), _DOWN, _OTHERS_FLY_ON),
-        beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
+        beyond_fence_m=ADRIFT_M, uncovered=ADRIFT,
     ),
     Fault(
-        "gps-lost-for-a-moment", "a robot's receiver has no fix for 1 s",
-        "it stands, and flies on once all was well for 3 s",
+        "gps-lost-for-a-moment", "no fix for 1 s",
+        "stands; flies on after 3 good seconds",
         does=(Do(do.lose_gps()), Do(do.lose_gps(lost=False), 1.0)),
         bounds=(
             _BRAKED, NotLandedBefore(25.0), FliesOn(0.8, from_s=10.0, until_s=24.0), _OTHERS_FLY_ON,
@@ -463,8 +463,8 @@ _FAULTS = (
         watched_s=25.0,
     ),
     Fault(
-        "gps-flickers", "a robot's fix comes and goes, for longer than a minute",
-        "it stands, and lands after 60 s",
+        "gps-flickers", "fix comes and goes for over a minute",
+        "stands; lands after 60 s",
         does=tuple(
             Do(do.lose_gps(lost=gap_s == 0.0), t + gap_s) for t in range(70) for gap_s in (0.0, 0.6)
         ),
@@ -474,15 +474,15 @@ _FAULTS = (
         watched_s=75.0, beyond_fence_m=ADRIFT_M,
     ),
     Fault(
-        "receiver-silent", "a robot's receiver falls silent",
-        "it stands 1.9 s after the receiver's last message, and lands after 3.5 s",
+        "receiver-silent", "receiver silent",
+        "stands within 1.9 s; lands after 3.5 s",
         does=(Do(do.silence(SimulatedSensor.GPS)),),
         bounds=(_BRAKED_LATER, Lands(4.5), _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
-        uncovered=_ADRIFT,
+        uncovered=ADRIFT,
     ),
     Fault(
-        "gps-inaccurate", "a robot's receiver says that it is accurate to 7 m only",
-        "it stands where it is, and lands after 60 s",
+        "gps-inaccurate", "reported accuracy 7 m",
+        "stands; lands after 60 s",
         does=(Do(do.report_accuracy(7.0)),),
         bounds=(
             Stands(from_s=4.0, until_s=58.0), NotLandedBefore(55.0), Lands(63.0), _OTHERS_FLY_ON,
@@ -490,21 +490,21 @@ _FAULTS = (
         watched_s=75.0,
     ),
     Fault(
-        "gps-useless", "a robot's receiver says that it is accurate to 15 m only",
-        "it stands, and lands after 2 s",
+        "gps-useless", "reported accuracy 15 m",
+        "stands; lands after 2 s",
         does=(Do(do.report_accuracy(15.0)),),
         bounds=(_BRAKED, Lands(3.5), _STRAIGHT_DOWN, _DOWN, _OTHERS_FLY_ON),
     ),
     Fault(
-        "gps-jumps", "a robot's fix jumps by 9 m, and back after 5 s",
-        "it stands, and lands after 2.5 s",
+        "gps-jumps", "fix jumps 9 m, back after 5 s",
+        "stands; lands after 2.5 s",
         does=(Do(do.jump_fix(9.0)), Do(do.jump_fix(0.0), 5.0)),
         bounds=(_BRAKED, Lands(3.5), StaysNear(10.0, until_s=60.0), _DOWN, _OTHERS_FLY_ON),
         watched_s=30.0, beyond_fence_m=POSITION_ERROR_M + 10.0,
     ),
     Fault(
-        "gps-jumps-for-a-moment", "a robot's fix jumps by 9 m, and back after 1 s",
-        "it stands, and flies on once nothing spoke against it for 3 s",
+        "gps-jumps-for-a-moment", "fix jumps 9 m, back after 1 s",
+        "stands; flies on after 3 good seconds",
         does=(Do(do.jump_fix(9.0)), Do(do.jump_fix(0.0), 1.0)),
         bounds=(
             NotFaster(2.2, until_s=25.0), NotLandedBefore(30.0),
@@ -513,74 +513,74 @@ _FAULTS = (
         watched_s=30.0, beyond_fence_m=POSITION_ERROR_M + 9.0,
     ),
     Fault(
-        "receiver-stuck", "a robot's receiver repeats its last fix, with a velocity of 0",
-        "it stops within 1.5 s, lands 2 s later, and drifts from 5 s on",
+        "receiver-stuck", "receiver repeats its fix at velocity 0",
+        "stops within 1.5 s, lands 2 s later, drifts from 5 s on",
         does=(Do(do.repeat_fix()),),
         bounds=(_BRAKED, Lands(3.5), _NEAR_STILL, _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
-        uncovered=_ADRIFT,
+        uncovered=ADRIFT,
     ),
     Fault(
-        "receiver-stuck-in-still-air", "the same, and no wind blows",
-        "it stops within 1.5 s, lands 2 s later, and is displaced by at most 10 m",
+        "receiver-stuck-in-still-air", "receiver repeats its fix, no wind",
+        "stops within 1.5 s, lands 2 s later, at most 10 m away",
         does=(Do(do.repeat_fix()),),
         bounds=(Lands(3.5), StaysNear(10.0, until_s=60.0), _DOWN, _OTHERS_FLY_ON), exact=True,
         beyond_fence_m=POSITION_ERROR_M + 10.0,
     ),
     Fault(
-        "receiver-creeps", "a robot's fix walks off at 2 m/s, and its velocity is honest",
-        "it stops within 3.7 s, lands 2 s later, and drifts 5 s later",
+        "receiver-creeps", "fix walks off at 2 m/s, its velocity honest",
+        "stops within 3.7 s, lands 2 s later, drifts 5 s later",
         does=(Do(do.falsify_fixes(creep_m_s=2.0)),),
         bounds=(Lands(6.5), _NEAR_STILL, _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
-        uncovered=_ADRIFT,
+        uncovered=ADRIFT,
     ),
     Fault(
-        "receiver-races", "a robot's receiver reports a velocity that is wrong by 3 m/s",
-        "it stops within 1 s, lands 5 s after the fault, and drifts 5 s later",
+        "receiver-races", "reported velocity wrong by 3 m/s",
+        "stops within 1 s, lands after 5 s, drifts 5 s later",
         does=(Do(do.falsify_fixes(velocity_bias_m_s=3.0)),),
         bounds=(Lands(5.5), _NEAR_STILL, _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
-        uncovered=_ADRIFT,
+        uncovered=ADRIFT,
     ),
     Fault(
-        "receiver-scatters", "a robot's fixes scatter by 10 m, and claim to be accurate",
-        "it stops within 1.5 s and lands; it drifts 5 s after PX4 rejects the fixes",
+        "receiver-scatters", "fixes scatter by 10 m, reported as accurate",
+        "stops within 1.5 s, lands; drifts 5 s after PX4 rejects them",
         does=(Do(do.falsify_fixes(scatter_m=10.0)),),
         bounds=(Lands(35.0), _NEAR_STILL, _DOWN, _OTHERS_FLY_ON), beyond_fence_m=ADRIFT_M,
-        uncovered=_ADRIFT,
+        uncovered=ADRIFT,
     ),
     Fault(
-        "receiver-stuck-in-takeoff", "a robot's receiver repeats its fix as it climbs",
-        "it lands, and drifts from 5 s on",
+        "receiver-stuck-in-takeoff", "receiver repeats its fix in the climb",
+        "lands; drifts from 5 s on",
         does=(Do(do.repeat_fix(), 10.0),), bounds=(Down(60.0), _OTHERS_TAKE_OFF), phase="takeoff",
-        beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
+        beyond_fence_m=ADRIFT_M, uncovered=ADRIFT,
     ),
     Fault(
-        "receiver-stuck-in-return", "a robot's receiver repeats its fix on its way home",
-        "it lands, and drifts from 5 s on",
+        "receiver-stuck-in-return", "receiver repeats its fix on the way home",
+        "lands; drifts from 5 s on",
         does=(Do(do.repeat_fix()),), bounds=(_NEAR_STILL, Down(60.0), _OTHERS_HOME), phase="return",
-        beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
+        beyond_fence_m=ADRIFT_M, uncovered=ADRIFT,
     ),
     Fault(
-        "estimate-freezes", "a robot's autopilot repeats the same position",
-        "it stands after 1.4 s, and lands 3 s after the freeze",
+        "estimate-freezes", "autopilot repeats one position",
+        "stands after 1.4 s; lands after 3 s",
         does=(Do(do.freeze_estimate()),), bounds=(_BRAKED_LATER, Lands(4.0), _DOWN, _OTHERS_FLY_ON),
-        beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
+        beyond_fence_m=ADRIFT_M, uncovered=ADRIFT,
     ),
     Fault(
-        "gps-drifts", "a robot's position drifts by 8 m in 40 s: more than its budget",
-        "nothing notices it, and no margin covers it: it may leave the fence by as much",
+        "gps-drifts", "position drifts 8 m in 40 s, beyond its budget",
+        "unnoticed; may leave the fence by as much",
         does=(Do(do.drift_estimate(inwards_m_s=0.2)), Do(do.drift_estimate(), 40.0)),
         bounds=(_OTHERS_FLY_ON,), watched_s=45.0, beyond_fence_m=POSITION_ERROR_M + 8.0,
         uncovered="it comes nearer to the others and to the fence by its error beyond the budget",
     ),
     Fault(
-        "height-drifts", "a robot's height drifts by 2 m within 40 s: its whole budget",
-        "nothing notices it; the heights' distance covers it",
+        "height-drifts", "height drifts 2 m in 40 s, its whole budget",
+        "unnoticed; the spacing of heights covers it",
         does=(Do(do.drift_estimate(down_m_s=0.05)), Do(do.drift_estimate(), 40.0)),
         bounds=(FliesOn(0.9, "all", until_s=40.0), _ALL_HOME), watched_s=45.0,
     ),
     Fault(
-        "height-jumps", "a robot's estimate of height jumps by 5 m",
-        "it stays at its height, and flies on after 3 s",
+        "height-jumps", "estimated height jumps 5 m",
+        "stays at its height; flies on after 3 s",
         does=(Do(do.jump_height(5.0)),),
         bounds=(
             KeepsHeight(1.6, until_s=20.0), FliesOn(0.8, from_s=10.0, until_s=24.0), _OTHERS_FLY_ON,
@@ -588,8 +588,8 @@ _FAULTS = (
         watched_s=25.0,
     ),
     Fault(
-        "origin-jumps", "the estimator's origin moves, by 7 m in the plane and 5.6 m up",
-        "the position is held back and then followed: no dash, and the height stays",
+        "origin-jumps", "estimator's origin moves 7 m in the plane, 5.6 m up",
+        "position held back, then followed: no dash, height stays",
         does=(Do(do.jump_origin(5.6, -4.2, 5.6)),),
         bounds=(
             KeepsHeight(1.5, until_s=15.0), NotFaster(2.2, until_s=15.0),
@@ -597,84 +597,84 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "compass-jumps", "a robot's heading is reset by 35 degrees in flight",
-        "it flies on",
+        "compass-jumps", "heading reset by 35°",
+        "flies on",
         does=(Do(do.jump_heading(35.0)),),
         bounds=(FliesOn(0.9, "all", until_s=20.0), LandsAtPad(_AT_PAD_M + 1.0, "all")),
         beyond_fence_m=POSITION_ERROR_M + 1.0,
     ),
     Fault(
-        "gps-lost-in-takeoff", "a robot's receiver loses its fix while it climbs",
-        "it lands",
+        "gps-lost-in-takeoff", "no fix in the climb",
+        "lands",
         does=(Do(do.lose_gps(), 10.0),), bounds=(Down(60.0), _OTHERS_TAKE_OFF), phase="takeoff",
-        beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
+        beyond_fence_m=ADRIFT_M, uncovered=ADRIFT,
     ),
     Fault(
-        "gps-lost-before", "a robot's receiver has no fix before takeoff",
-        "it does not take off",
+        "gps-lost-before", "no fix before takeoff",
+        "does not take off",
         does=(Do(do.lose_gps()),), bounds=_ONE_STAYS_DOWN, phase="ready",
     ),
     # Batteries, motors and air
     Fault(
-        "battery-low", "a robot's battery falls below 25 %",
-        "it returns, and lands at its pad",
+        "battery-low", "battery below 25 %",
+        "returns, lands at its pad",
         does=(Do(do.drain(0.245)),),
         bounds=(MissionEnds(4.0), _OTHERS_FLY_ON, LandsAtPad(_AT_PAD_M), Down(_HOME_S)),
         watched_s=60.0,
     ),
     Fault(
-        "batteries-low", "five batteries, or all, fall below 25 % at once",
-        "all return, at their own heights, and land at their pads",
+        "batteries-low", "five batteries, or all, below 25 %",
+        "return at their own heights, land at their pads",
         does=(Do(do.drain(0.245)),),
         bounds=(MissionEnds(4.0), LandsAtPad(_AT_PAD_M), Down(_HOME_S)), hits=5, watched_s=60.0,
         home=False,
     ),
     Fault(
-        "battery-critical", "a robot's battery falls below 15 %",
-        "it lands where it is, at once",
+        "battery-critical", "battery below 15 %",
+        "lands in place at once",
         does=(Do(do.drain(0.145)),), bounds=(Lands(3.5), _STRAIGHT_DOWN, _DOWN, _OTHERS_FLY_ON),
     ),
     Fault(
-        "battery-critical-for-px4", "a battery is critical for PX4, not for the robot",
-        "PX4 holds, and then lands; the robot does not take it from PX4",
+        "battery-critical-for-px4", "battery critical for PX4 alone",
+        "PX4 holds, then lands; the robot lets it",
         does=_CRITICAL_FOR_PX4,
         bounds=(MissionEnds(1.5), Lands(8.0), Down(8.0 + _LANDING_S), _OTHERS_FLY_ON),
     ),
     Fault(
-        "battery-silent", "a robot's battery is no longer reported",
-        "an alarm; the mission goes on",
+        "battery-silent", "battery not reported",
+        "alarm; flies on",
         does=(Do(do.silence(SimulatedSensor.BATTERY)),),
         bounds=(FliesOn(0.9, "all", until_s=20.0),),
     ),
     Fault(
-        "storm", "a storm of 16 m/s carries a robot over the fence, for 10 s",
-        "it is flown back; 5 m beyond the fence PX4 holds it, and it lands after 60 s",
+        "storm", "storm of 16 m/s for 10 s carries it over the fence",
+        "flown back; 5 m beyond PX4 holds, lands after 60 s",
         does=(Do(do.blow(_STORM_M_S)), Do(do.blow(), _STORM_S)),
         bounds=(ComesBack(_STORM_S + 30.0), _OTHERS_FLY_ON), watched_s=90.0,
         beyond_fence_m=POSITION_ERROR_M + 5.0 + _CARRIED_M,
         uncovered="wind beyond its airspeed carries it, whatever it is told",
     ),
     Fault(
-        "gusts", "gusts of 2 m/s (standard deviation) besides the wind, on all",
-        "the mission goes on",
+        "gusts", "gusts of 2 m/s rms besides the wind, on all",
+        "all fly on",
         does=(Do(do.blow(gusts_m_s=2.0)),),
         bounds=(FliesOn(0.9, "all", until_s=20.0), LandsAtPad(_AT_PAD_M + 2.0, "all")), hits=0,
         beyond_fence_m=POSITION_ERROR_M + 2.0,
     ),
     Fault(
-        "motor-weakens", "a motor weakens in flight, by a third of all thrust",
-        "the mission goes on",
+        "motor-weakens", "a motor weakens by a third of all thrust",
+        "flies on",
         does=(Do(do.weaken_motors(0.33)),), bounds=(FliesOn(0.9, "all", until_s=20.0), _ALL_HOME),
     ),
     Fault(
-        "sinks", "a robot's motors lift too little in flight, and it sinks",
-        "1.5 m below its height for 2 s: it holds, apart from others, and lands 3 s later",
+        "sinks", "motors lift too little",
+        "1.5 m low for 2 s: holds apart, lands 3 s later",
         does=(Do(_SINKS),),
         bounds=(_SINKING_NOTICED, Lands(8.5), Down(8.5 + _LANDING_S), _OTHERS_FLY_ON),
     ),
     Fault(
-        "sinks-slowly", "a robot's motors lift slightly too little, and it sinks at 0.3 m/s",
-        "as for a robot that sinks faster, but later",
+        "sinks-slowly", "sinks at 0.3 m/s",
+        "as in sinks, later",
         does=(Do(_SINKS_SLOWLY),),
         bounds=(
             _SINKING_NOTICED, Lands(15.0), Down(15.0 + _LANDING_S),
@@ -683,42 +683,42 @@ _FAULTS = (
         watched_s=30.0,
     ),
     Fault(
-        "sinks-in-takeoff", "a robot's motors lift too little while it climbs",
-        "it holds, and lands 3 s later",
+        "sinks-in-takeoff", "motors lift too little in the climb",
+        "holds, lands 3 s later",
         does=(Do(_SINKS, 9.0),), bounds=(_OTHERS_TAKE_OFF, Down(20.0 + _LANDING_S)),
         phase="takeoff",
     ),
     Fault(
-        "sinks-in-return", "a robot's motors lift too little on its way home",
-        "it holds, apart from others, and lands 3 s later",
+        "sinks-in-return", "motors of two lift too little on the way home",
+        "hold apart, land 3 s later",
         does=(Do(_SINKS),), bounds=(Down(20.0 + _LANDING_S), _OTHERS_HOME), phase="return", hits=2,
     ),
     Fault(
-        "sinks-for-a-while", "a robot's motors lift too little for 7 s",
-        "it lands all the same, and does not climb to its height again",
+        "sinks-for-a-while", "motors lift too little for 7 s",
+        "lands all the same, without climbing again",
         does=(Do(_SINKS), Do(do.weaken_motors(0.0), 7.0)),
         bounds=(_SINKING_NOTICED, Lands(8.5), Climbs(2.0), Down(8.5 + _LANDING_S), _OTHERS_FLY_ON),
     ),
     Fault(
-        "does-not-climb", "a robot's motors do not lift it",
-        "it gives up after 15 s: LAND, disarm",
+        "does-not-climb", "motors do not lift it",
+        "LAND, disarm after 15 s",
         does=(Do(do.weaken_motors(1.0)),), bounds=(_OTHERS_TAKE_OFF, Down(60.0)), phase="ready",
         watched_s=30.0,
     ),
     Fault(
-        "sensor-dead-before", "a robot's barometer is dead before takeoff",
-        "it does not take off",
+        "sensor-dead-before", "barometer dead before takeoff",
+        "does not take off",
         does=(Do(do.silence(SimulatedSensor.BAROMETER)),), bounds=_ONE_STAYS_DOWN, phase="ready",
     ),
     Fault(
-        "battery-low-before", "a robot's battery is at 30 % before takeoff",
-        "it does not take off",
+        "battery-low-before", "battery at 30 % before takeoff",
+        "does not take off",
         does=(Do(do.change_battery(0.30)),), bounds=_ONE_STAYS_DOWN, phase="ready",
     ),
     # People
     Fault(
-        "pilot-takes-it", "a pilot takes a robot by remote control, and flies it 15 s",
-        "nothing more is sent to it until the operator orders rejoin",
+        "pilot-takes-it", "pilot takes it, flies 15 s",
+        "nothing more is sent until rejoin",
         does=(
             Do(do.pilot_flies(0.0, 0.0)), Do(do.pilot_flies(-1.0, 0.0), 2.0),
             Do(do.pilot_flies(), 8.0), Do(do.OperatorOrders("rejoin"), 15.0),
@@ -731,14 +731,14 @@ _FAULTS = (
         watched_s=35.0, settings=(_RC,),
     ),
     Fault(
-        "pilot-lands-it", "a pilot takes a robot, and lands it",
-        "nothing more is sent to it",
+        "pilot-lands-it", "pilot takes it and lands",
+        "nothing more is sent",
         does=(Do(do.pilot_flies()), Do(do.pilot_lands(), 6.0)),
         bounds=(FallsSilent(1.1), Down(8.0 + _LANDING_S), _OTHERS_FLY_ON), settings=(_RC,),
     ),
     Fault(
-        "ground-station-holds-it", "another ground station sets PX4's hold",
-        "the program lets go: nothing more is sent to it until rejoin",
+        "ground-station-holds-it", "another ground station sets hold",
+        "nothing more is sent until rejoin",
         does=(Do(do.set_mode(Px4Mode.HOLD)), Do(do.OperatorOrders("rejoin"), 12.0)),
         bounds=(
             FallsSilent(1.2, until_s=11.9), Stands(from_s=3.0, until_s=20.0), NotLandedBefore(20.0),
@@ -746,15 +746,15 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "ground-station-lands-it", "another ground station sets PX4's landing",
-        "the robot does not fight it, and lands",
+        "ground-station-lands-it", "another ground station sets land",
+        "lands, unopposed",
         does=(Do(do.set_mode(Px4Mode.LAND)),),
         bounds=(Lands(0.5), _STRAIGHT_DOWN, _DOWN, _OTHERS_FLY_ON),
     ),
     Fault(
         "parameter-changed",
-        "another ground station lets PX4 fly on without its program, which dies 5 s later",
-        "an alarm, and the robot has set it back: PX4 lands the vehicle",
+        "another station has PX4 fly on without its program, which dies 5 s later",
+        "alarm; set back in time: PX4 lands it",
         does=(
             Do(do.set_parameter("COM_OBL_RC_ACT", 5)), Do(do.set_parameter("COM_OF_LOSS_T", 30.0)),
             Do(do.set_parameter("GF_ACTION", 0)),
@@ -766,9 +766,8 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "fence-cleared",
-        "another ground station clears PX4's fence; 5 s later the robot is 3 m beyond it",
-        "an alarm, and the robot has uploaded it again: PX4 holds the vehicle",
+        "fence-cleared", "another station clears PX4's fence; 5 s later 3 m beyond it",
+        "alarm; uploaded again: PX4 holds",
         does=(
             Do(do.clear_fence()), Do(do.jump_outside(8.0), _SET_BACK_S),
             # Where it really is: it was carried nowhere.
@@ -781,40 +780,38 @@ _FAULTS = (
         uncovered="a robot that is wrong about its place reports a wrong place as it comes down",
     ),
     Fault(
-        "parameter-changed-before",
-        "another ground station sets a parameter of PX4 each second before takeoff",
-        "it does not take off",
+        "parameter-changed-before", "another station sets a parameter each second",
+        "does not take off",
         does=tuple(Do(do.set_parameter("COM_OBL_RC_ACT", 5), at_s) for at_s in _EACH_SECOND),
         bounds=_ONE_STAYS_DOWN, phase="ready",
     ),
     Fault(
-        "fence-cleared-before",
-        "another ground station clears PX4's fence each second before takeoff",
-        "it does not take off",
+        "fence-cleared-before", "another station clears PX4's fence each second",
+        "does not take off",
         does=tuple(Do(do.clear_fence(), at_s) for at_s in _EACH_SECOND), bounds=_ONE_STAYS_DOWN,
         phase="ready",
     ),
     Fault(
-        "remote-control-lost", "a robot's remote control is lost, and rc_lost = alarm",
-        "an alarm; the mission goes on",
+        "remote-control-lost", "remote control lost, rc_lost = alarm",
+        "alarm; flies on",
         does=(Do(do.lose_remote_control()),), bounds=(FliesOn(0.9, "all", until_s=20.0),),
         settings=(_RC,),
     ),
     Fault(
-        "remote-control-lost-lands", "a remote control is lost, and rc_lost = land",
-        "it is told to land after 1.5 s; PX4 holds it for COM_FAIL_ACT_T (5 s) first",
+        "remote-control-lost-lands", "remote control lost, rc_lost = land",
+        "LAND after 1.5 s; PX4 first holds for 5 s (COM_FAIL_ACT_T)",
         does=(Do(do.lose_remote_control()),),
         bounds=(MissionEnds(2.5), Lands(7.5), Down(7.5 + _LANDING_S)),
         settings=(_RC, ("failsafe", "rc_lost", "land")),
     ),
     Fault(
-        "killed", "the operator kills a robot",
-        "the motors stop, and the vehicle falls; the others fly on",
+        "killed", "operator kills it",
+        "motors stop, it falls; others fly on",
         does=(Do(do.OperatorOrders("kill")),), bounds=(MotorsOff(0.6), _OTHERS_FLY_ON),
     ),
     Fault(
-        "held", "the operator holds all",
-        "they stand where they are, until start is ordered",
+        "held", "operator holds all",
+        "stand in place until start",
         does=(Do(do.OperatorOrders("hold"), to="all"),),
         bounds=(
             MissionEnds(0.6, "all"), Stands(robots="all", from_s=4.0, until_s=20.0),
@@ -823,13 +820,13 @@ _FAULTS = (
         hits=0,
     ),
     Fault(
-        "second-ground", "a second operator's ground joins, and commands nothing",
-        "robots go on obeying the first one",
+        "second-ground", "second ground joins, commands nothing",
+        "robots obey the first",
         does=(Do(do.SecondLaptop("joins")),), bounds=_MISSION_GOES_ON, hits=0,
     ),
     Fault(
-        "second-ground-holds", "a second operator, who does not command, holds all",
-        "they hold at once, until start is ordered",
+        "second-ground-holds", "second operator, not in command, holds all",
+        "hold at once, until start",
         does=(Do(do.SecondLaptop("joins")), Do(do.SecondLaptop("holds all"), 6.0)),
         bounds=(
             FliesOn(0.95, "all", until_s=6.0), MissionEnds(7.0, "all"),
@@ -840,8 +837,8 @@ _FAULTS = (
     ),
     Fault(
         "second-ground-takes-command",
-        "a second operator takes the command, and the first one orders hold, then land",
-        "the mission goes on; they hold and land for the first one, too",
+        "second operator takes command; the first orders hold, then land",
+        "fly on; hold and land for the first, too",
         does=(
             Do(do.SecondLaptop("joins")), Do(do.SecondLaptop("takes command"), 6.0),
             Do(do.OperatorOrders("hold"), 16.0, "all"),
@@ -857,8 +854,8 @@ _FAULTS = (
     ),
     Fault(
         "second-ground-dies-in-command",
-        "a second operator takes the command, and is gone; the first one only looks on",
-        "hold after 3 s, land where they are after 13 s",
+        "second operator takes command, is gone; the first looks on",
+        "hold after 3 s; land in place after 13 s",
         does=(
             Do(do.SecondLaptop("joins")), Do(do.SecondLaptop("takes command"), 6.0),
             Do(do.SecondLaptop("dies"), 12.0, mark="gone"),
@@ -873,46 +870,46 @@ _FAULTS = (
         hits=0, watched_s=40.0, home=False,
     ),
     Fault(
-        "landed", "the operator lands all where they are",
-        "they come straight down",
+        "landed", "operator lands all",
+        "come straight down",
         does=(Do(do.OperatorOrders("land"), to="all"),),
         bounds=(Lands(1.0, "all"), StraightDown(3.0, "all"), Down(_LANDING_S, "all")), hits=0,
         home=False,
     ),
     Fault(
-        "landed-in-takeoff", "the operator lands all while they take off",
-        "they come straight down",
+        "landed-in-takeoff", "operator lands all in the climb",
+        "come straight down",
         does=(Do(do.OperatorOrders("land"), 10.0, "all", "ordered"),),
         bounds=(Lands(1.5, "all", after="ordered"), Down(12.0 + _LANDING_S, "all")),
         phase="takeoff", hits=0, home=False,
     ),
     Fault(
-        "swapped-pads", "two robots were set on each other's pads",
-        "neither takes off: each stands where another one lands",
+        "swapped-pads", "two stand on each other's pads",
+        "neither takes off",
         does=(Do(do.carry_to_pad()), Do(do.carry_to_pad(-1), to="next")),
         bounds=(StaysDown(), StaysDown(robots="next")), phase="ready",
     ),
     Fault(
-        "pad-taken-before", "a robot stands beside another's landing point at first",
-        "the other one does not take off",
+        "pad-taken-before", "stands beside another's landing point",
+        "the other does not take off",
         # It stays there: its own battery is too low for a takeoff.
         does=(Do(do.carry_to_pad(beside_m=2.0)), Do(do.change_battery(0.30))),
         bounds=(StaysDown(), StaysDown(robots="next")), phase="ready", watched_s=30.0, exact=True,
     ),
     Fault(
-        "pad-taken-in-flight", "a robot that landed is carried to another's pad",
-        "the other one lands beside it",
+        "pad-taken-in-flight", "one that landed is carried to another's pad",
+        "the other lands beside it",
         does=(Do(do.OperatorOrders("land")), *(Do(do.carry_to_pad(), t) for t in (55.0, 60.0))),
         bounds=(_OTHERS_FLY_ON, LandsAtPad(8.0, "next")), watched_s=65.0, exact=True,
     ),
     Fault(
-        "fence-without-a-pad", "the operator sets a fence without one landing point",
-        "that robot does not take off",
+        "fence-without-a-pad", "fence set without its landing point",
+        "does not take off",
         does=(Do(do.FenceWithout()),), bounds=(StaysDown(),), phase="ready", watched_s=30.0,
     ),
     Fault(
-        "somebody-over-the-pad", "a pilot hovers above another's pad, at its height",
-        "the one that comes home keeps 1 m away, and waits",
+        "somebody-over-the-pad", "pilot hovers over another's pad at its height",
+        "the one coming home keeps 1 m away, waits",
         does=(
             *(Do(do.pilot_flies_over(), float(t)) for t in range(80)),
             Do(do.OperatorOrders("return"), 45.0, "next"),
@@ -924,8 +921,8 @@ _FAULTS = (
         settings=(_RC,),
     ),
     Fault(
-        "start-outside", "a held robot is beyond the fence; resume is ordered",
-        "start is refused outside: it is flown back first",
+        "start-outside", "held beyond the fence; resume ordered",
+        "start refused outside: flown back first",
         does=(
             Do(do.OperatorOrders("hold")), Do(do.jump_outside(4.5), 4.0),
             Do(do.OperatorOrders("resume"), 8.5, mark="start"),
@@ -937,8 +934,8 @@ _FAULTS = (
     ),
     # Two at once
     Fault(
-        "critical-and-held", "a critical battery, and the operator holds all 1 s later",
-        "the landing comes before the hold",
+        "critical-and-held", "critical battery; all held 1 s later",
+        "landing precedes hold",
         does=(Do(do.drain(0.145)), Do(do.OperatorOrders("hold"), 5.0, "all")),
         bounds=(
             Lands(3.5), _DOWN, Stands(robots="others", from_s=9.0, until_s=20.0, may_part=True),
@@ -947,90 +944,105 @@ _FAULTS = (
         ),
     ),
     Fault(
-        "critical-while-piloted", "a battery is critical while a pilot flies",
-        "the pilot comes before it: nothing is sent",
+        "critical-while-piloted", "critical battery under a pilot",
+        "pilot precedes: nothing is sent",
         does=(Do(do.pilot_flies()), Do(do.drain(0.145), 3.0), Do(do.pilot_lands(), 12.0)),
         bounds=(FallsSilent(1.1), NotLandedBefore(11.9), _OTHERS_FLY_ON), settings=(_RC,),
     ),
     Fault(
-        "killed-while-piloted", "the operator kills a robot that a pilot flies",
-        "kill comes before the pilot",
+        "killed-while-piloted", "operator kills it under a pilot",
+        "kill precedes the pilot",
         does=(Do(do.pilot_flies()), Do(do.OperatorOrders("kill"), 3.0)),
         bounds=(MotorsOff(3.6), _OTHERS_FLY_ON), settings=(_RC,),
     ),
     Fault(
-        "piloted-while-it-hangs", "a control loop hangs, and a pilot takes it meanwhile",
-        "the loop, once back, does not take it from the pilot",
+        "piloted-while-it-hangs", "control loop hangs; a pilot takes it meanwhile",
+        "the loop, once back, leaves it to the pilot",
         does=(
             Do(do.LoopHangs("control", 3.0)), Do(do.pilot_flies(), 1.5), Do(do.pilot_lands(), 12.0),
         ),
         bounds=(_HOLDS, FallsSilent(0.6), _OTHERS_FLY_ON), settings=(_RC,),
     ),
     Fault(
-        "low-battery-and-no-ground", "a low battery, and the ground is lost 2 s later",
-        "it returns, holds after 3 s, and lands after 13 s",
+        "low-battery-and-no-ground", "low battery; ground lost 2 s later",
+        "returns, holds after 3 s, lands after 13 s",
         does=(Do(do.drain(0.245)), Do(do.RadioCut("from the ground"), 2.0)),
         bounds=(MissionEnds(6.0, "all"), Lands(16.5, "all"), Down(17.0 + _LANDING_S, "all")),
         watched_s=30.0, home=False,
     ),
     Fault(
-        "gps-lost-and-radio-dies", "a robot loses GPS, and the radio dies with it",
-        "that one lands for its position, all others for the ground",
+        "gps-lost-and-radio-dies", "no fix, and the radio dies",
+        "lands for its position, all others for the ground",
         does=(Do(do.lose_gps()), Do(do.RadioCut("all"))),
         bounds=(Lands(3.3), Lands(14.0, "others"), _ALL_DOWN), watched_s=30.0, home=False,
-        beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
+        beyond_fence_m=ADRIFT_M, uncovered=ADRIFT,
     ),
     Fault(
-        "two-programs-die", "two robots' programs die at once",
-        "PX4 lands both; the others fly on",
+        "two-programs-die", "two programs die",
+        "PX4 lands both; others fly on",
         does=(Do(do.RobotProgram("dies")),), bounds=_PX4_LANDS_IT, hits=2,
     ),
     Fault(
-        "program-dies-as-the-ground-does", "a program dies, and the ground with it",
-        "PX4 lands the one after 1 s, the others land after 13 s",
+        "program-dies-as-the-ground-does", "program and ground die",
+        "PX4 lands it after 1 s; others land after 13 s",
         does=(Do(do.RobotProgram("dies")), Do(do.Laptop("dies"))),
         bounds=(Lands(1.3), Lands(14.0, "others"), _ALL_DOWN), watched_s=30.0, home=False,
     ),
     Fault(
-        "px4-lands-and-return", "a battery is critical for PX4; the operator returns all",
-        "PX4's failsafe comes before the return",
+        "px4-lands-and-return", "battery critical for PX4; all ordered to return",
+        "PX4's failsafe precedes the return",
         does=(*_CRITICAL_FOR_PX4, Do(do.OperatorOrders("return"), 2.0, "all")),
         bounds=(Lands(8.0), Down(8.0 + _LANDING_S), _OTHERS_HOME),
     ),
     Fault(
-        "gps-lost-in-return", "a robot's receiver loses its fix on its way home",
-        "it lands",
+        "gps-lost-in-return", "no fix on the way home",
+        "lands",
         does=(Do(do.lose_gps()),), bounds=(Down(60.0), _OTHERS_HOME), phase="return",
-        beyond_fence_m=ADRIFT_M, uncovered=_ADRIFT,
+        beyond_fence_m=ADRIFT_M, uncovered=ADRIFT,
     ),
     Fault(
-        "hangs-on-a-bad-radio", "a program stops for 4 s while half of all is lost",
-        "it holds until start is ordered; the others fly on",
+        "hangs-on-a-bad-radio", "program stops for 4 s, half of all messages lost",
+        "holds until start; others fly on",
         does=(Do(do.RadioIs(loss=0.5)), Do(do.ProgramStops(4.0))),
         bounds=(_HOLDS, MissionEnds(0.6), _STANDS, NotLandedBefore(20.0), _OTHERS_FLY_ON),
     ),
     Fault(
-        "origin-jumps-as-it-hangs", "a control loop hangs for 2 s; the origin jumps",
-        "it holds where it is",
+        "origin-jumps-as-it-hangs", "control loop hangs for 2 s; the origin jumps",
+        "holds in place",
         does=(Do(do.LoopHangs("control", 2.0)), Do(do.jump_origin(5.6, -4.2, 0.0), 1.0)),
         bounds=(_HOLDS, MissionEnds(0.6), _STANDS, NotLandedBefore(20.0), _OTHERS_FLY_ON),
     ),
     Fault(
-        "rejoin-without-gps", "a pilot has a robot that loses GPS; rejoin is ordered",
-        "rejoin is refused: the pilot has it",
+        "rejoin-without-gps", "pilot has it, no fix; rejoin ordered",
+        "rejoin refused: the pilot has it",
         does=(
             Do(do.pilot_flies()), Do(do.lose_gps(), 3.0), Do(do.OperatorOrders("rejoin"), 8.0),
             Do(do.pilot_lands(), 9.0),
         ),
         bounds=(FallsSilent(1.1), _OTHERS_FLY_ON), settings=(_RC,), beyond_fence_m=ADRIFT_M,
-        uncovered=_ADRIFT,
+        uncovered=ADRIFT,
     ),
     Fault(
-        "storm-and-low-battery", "gusts on all, and a robot's battery is low",
-        "it returns, and lands at its pad",
+        "storm-and-low-battery", "gusts on all; its battery low",
+        "returns, lands at its pad",
         does=(Do(do.blow(gusts_m_s=2.0), to="all"), Do(do.drain(0.245), 1.0)),
         bounds=(MissionEnds(5.0), LandsAtPad(_AT_PAD_M + 2.0), Down(1.0 + _HOME_S)), watched_s=60.0,
         beyond_fence_m=POSITION_ERROR_M + 2.0, carried="all",
     ),
 )  # fmt: skip
 FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in _FAULTS}
+# By short names for tables, the longest first.
+SHARED_BOUNDS: Mapping[str, tuple[Criterion, ...]] = {
+    "wait-land": _ALL_WAIT_AND_LAND,
+    "px4-lands": _PX4_LANDS_IT,
+    "fly-home": _MISSION_GOES_ON,
+    "grounded": _ONE_STAYS_DOWN,
+    "others-fly": (_OTHERS_FLY_ON,),
+    "all-fly": (_ALL_FLY_ON,),
+    "home": (_ALL_HOME,),
+    "straight": (_STRAIGHT_DOWN,),
+    "down": (_DOWN,),
+    "px4-holds": (_HOLDS,),
+    "brakes": (_BRAKED,),
+    "near": (_NEAR_STILL,),
+}

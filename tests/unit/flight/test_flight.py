@@ -2261,13 +2261,16 @@ def table() -> list[str]:
     """The machine as rows of Markdown, in the order of `TRANSITIONS`.
 
     From, to, when, and what the operator reads: that is from the scenarios, with numbers as "…".
+    The states of which all four appear together are "flying".
     """
-    rows = []
+    rows, above = [], ""
     reasons = reasons_by_row()
     for row in TRANSITIONS:
         everywhere = set(row.sources) == set(FlightState)
         sources = "any" if everywhere else ", ".join(state.name for state in row.sources)
+        sources = sources.replace("TAKEOFF, HOLD, MISSION, RETURN", "flying")
         said = "; ".join(sorted(reasons[row.when, row.target]))
+        said, above = ("as above" if said == above else said), said
         rows.append(f"| {sources} | {row.target.name} | {row.when} | {said} |")
     return rows
 
