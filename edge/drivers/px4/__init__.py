@@ -1,1 +1,1 @@
-"""PX4 by MAVLink: autopilot, telemetry, events, watchdog."""
+"""PX4 over MAVLink: autopilot, telemetry, events, watchdog."""

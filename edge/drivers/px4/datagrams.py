@@ -1,7 +1,7 @@
-"""The UDP socket between MAVSDK and the vehicle: what comes in is sorted before MAVSDK has it.
+"""UDP socket between MAVSDK and the vehicle, which drops duplicate and late frames.
 
-MAVSDK's own socket tells neither the frames' numbers nor where they came from, so that a frame that
-comes twice or late would count as news, and nobody would know how many are lost.
+MAVSDK's own socket reports neither sequence numbers nor senders. Duplicate and late frames would
+then count as new, and lost ones could not be counted.
 """
 
 import socket
@@ -17,8 +17,8 @@ from edge.drivers.px4.reception import Frame, VehicleFrames
 
 _AUTOPILOT = 1  # component id
 _BYTES = 65535
-_LOOK_S = 0.2
-# Message -> how its payload begins, with the vehicle's time, and that in s.
+_RECEIVE_TIMEOUT_S = 0.2
+# Message -> format of the vehicle's time at the payload's begin, and its unit, s.
 _TIMES = {
     32: (struct.Struct("<I"), 1e-3),  # LOCAL_POSITION_NED
     33: (struct.Struct("<I"), 1e-3),  # GLOBAL_POSITION_INT
@@ -27,39 +27,39 @@ _TIMES = {
 
 
 class LinkState(NamedTuple):
-    """How one vehicle's frames arrive: see `VehicleFrames`."""
+    """State of one vehicle's link: see `VehicleFrames`."""
 
     lost: float = 0.0
-    twice: bool = False
-    has_others: bool = False
+    has_duplicates: bool = False
+    has_twin: bool = False
 
 
 class Datagrams:
-    """One UDP port; a thread of its own passes on the frames that are taken.
+    """One UDP port; its thread passes accepted frames to a callback.
 
-    Answers go to where the vehicle's frames come from. Every method may be called from any thread.
+    Outgoing frames go to the sender of the vehicle's frames. Thread-safe.
     """
 
-    def __init__(self, host: str, port: int, pass_on: Callable[[bytes], None]) -> None:
+    def __init__(self, host: str, port: int, on_frames: Callable[[bytes], None]) -> None:
         """Raises OSError."""
         self._system_id: int | None = None
-        self._pass_on = pass_on
+        self._on_frames = on_frames
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        # What lands a vehicle that was left alone may have the port still.
+        # `edge.drivers.px4.unattended` may still have the port.
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((host, port))
         except OSError:
             self._socket.close()
             raise
-        self._socket.settimeout(_LOOK_S)
+        self._socket.settimeout(_RECEIVE_TIMEOUT_S)
         self._lock = Lock()
         self._receptions: dict[int, VehicleFrames] = {}
         self._closing = False
         self._thread = Thread(target=self._receive, name="mavlink")
 
     def start(self) -> None:
-        """Begin to receive."""
+        """Start receiving."""
         self._thread.start()
 
     def follow(self, system_id: int) -> None:
@@ -67,30 +67,29 @@ class Datagrams:
         self._system_id = system_id
 
     def close(self) -> None:
-        """Neither receive nor send any more."""
+        """Stop receiving, and close the socket."""
         self._closing = True
         if self._thread.ident is not None:
             self._thread.join()
         self._socket.close()
 
     def send(self, data: bytes) -> None:
-        """To the vehicle, if it was heard."""
+        """Send to the vehicle, if a frame of it was received."""
         with self._lock:
             reception = self._receptions.get(self._system_id or 0)
             path = None if reception is None else reception.path
         if isinstance(path, tuple):
-            # UDP: what cannot be sent is lost.
             with suppress(OSError):
                 self._socket.sendto(data, path)
 
     def state(self, now_s: float) -> LinkState:
-        """How the vehicle's frames arrive."""
+        """State of the selected vehicle's link."""
         with self._lock:
             reception = self._receptions.get(self._system_id or 0)
             if reception is None:
                 return LinkState()
             return LinkState(
-                reception.lost(now_s), reception.arrives_twice(now_s), reception.has_others(now_s)
+                reception.lost(now_s), reception.has_duplicates(now_s), reception.has_twin(now_s)
             )
 
     def _receive(self) -> None:
@@ -99,21 +98,22 @@ class Datagrams:
                 data, address = self._socket.recvfrom(_BYTES)
             except OSError:
                 continue
-            taken = b"".join(frame.content for frame in frames(data) if self._take(frame, address))
-            if taken:
-                self._pass_on(taken)
+            accepted = b"".join(
+                frame.content for frame in frames(data) if self._accept(frame, address)
+            )
+            if accepted:
+                self._on_frames(accepted)
 
-    def _take(self, frame: RawFrame, address: tuple[str, int]) -> bool:
-        """Other parts of the vehicle, and ground stations, have numbers of their own."""
+    def _accept(self, frame: RawFrame, address: tuple[str, int]) -> bool:
         if frame.component_id != _AUTOPILOT:
-            return True
+            return True  # other components and ground stations count their own sequences
         vehicle_s = None
         if frame.message_id in _TIMES:
             begin, unit_s = _TIMES[frame.message_id]
-            # Trailing zeros are left out.
+            # MAVLink 2 leaves out trailing zeros.
             (count,) = begin.unpack_from(frame.payload.ljust(begin.size, b"\0"))
             vehicle_s = count * unit_s
-        told = Frame(address, frame.number, frame.content, frame.message_id, vehicle_s)
+        received = Frame(address, frame.number, frame.content, frame.message_id, vehicle_s)
         with self._lock:
             reception = self._receptions.setdefault(frame.system_id, VehicleFrames())
-            return reception.take(told, time.monotonic())
+            return reception.accept(received, time.monotonic())

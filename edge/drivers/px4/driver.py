@@ -1,4 +1,4 @@
-"""The type "px4" of robot.toml's [autopilot]."""
+"""Vehicle of type "px4"."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,13 +12,16 @@ from edge.drivers.px4.watchdog import WatchdogProcess
 
 
 def vehicle_lock(port: int) -> ProcessLock:
-    """Keeps other programs of this machine from the vehicle whose datagrams come in there."""
+    """Lock against other programs of this machine that use the vehicle on that UDP port."""
     return ProcessLock(f"the autopilot's port {port}")
 
 
 @contextmanager
 def px4_vehicle(setting: VehicleSetting) -> Iterator[OpenVehicle]:
-    """PX4 over MAVSDK. It has no options. Raises ConfigError, OSError."""
+    """Open the vehicle of `type = "px4"` in [autopilot]; it has no options.
+
+    Raises ConfigError or OSError.
+    """
     no_options("autopilot", setting.options)
     port = int(setting.url.rpartition(":")[2])
     with (

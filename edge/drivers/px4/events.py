@@ -1,12 +1,12 @@
-"""Why PX4 does not arm, and why it takes over: its EVENT messages in, reasons out.
+"""PX4's EVENT messages -> reasons why it does not arm or takes over. No socket, thread or clock.
 
-No socket, thread or clock. PX4 sends events on every link, also to a companion, where STATUSTEXT
-goes only to a ground station. An event carries the hash of its name and arguments, no words: the
-words here are ours, so that they are there at once and on any vehicle, also on one that does not
-give its own over MAVLink. Names and arguments are those of v1.14 to v1.17, ModalAI's v1.14 too.
+PX4 sends events on every link, also to a companion computer; STATUSTEXT goes only to ground
+stations. An event has the hash of its name and arguments, but no text. The texts are defined here:
+they are available at once, also for a vehicle that does not provide its own over MAVLink. Names and
+arguments are those of v1.14 to v1.17, including ModalAI's v1.14.
 
-PX4 reports all that its checks find in one go, whenever that changes or RUN_PREARM_CHECKS asks for
-it: a summary, the checks that fail, another summary. What a report does not name has passed.
+PX4 sends a report of its checks whenever their result changes, and for RUN_PREARM_CHECKS: a
+summary, the failed checks, another summary. Checks that a report does not name have passed.
 """
 
 import re
@@ -20,7 +20,7 @@ from edge.core.vehicle import AutopilotReason, Mode
 
 _WARNING, _ERROR = 4, 3
 
-# An event's arguments, as struct has them; capitals A, C, S and G stand for one byte that says:
+# Event arguments use struct's format characters; A, C, S and G are bytes with these meanings:
 _VALUES: dict[str, dict[int, str]] = {
     "A": {
         1: "warns",
@@ -46,7 +46,7 @@ _VALUES: dict[str, dict[int, str]] = {
     "G": {0: "too far from home", 1: "too high above home", 2: "at or beyond the fence"},
 }
 
-# Name -> text, or text and the types of the arguments that it shows.
+# Name -> text, or text and the formats of the arguments that it shows.
 _WORDS: dict[str, str | tuple[str, str]] = {
     # Sensors
     "check_accel_missing": ("accelerometer {0} is missing", "B"),
@@ -151,9 +151,9 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "check_failure_detector_alt": "lost height",
     "check_failure_detector_ext": "an external failure detector fired",
     # Remote control and links
-    "check_modes_manual_control": "no sticks are heard",
+    "check_modes_manual_control": "no stick input arrives",
     "check_modes_offboard_signal": "offboard is not possible: setpoints or position are missing",
-    "check_rc_dl_no_dllink": "no ground station is heard",
+    "check_rc_dl_no_dllink": "no ground station is connected",
     "check_rc_dz_too_high": ("remote control's channel {0}: dead zone is above {1}", "BH"),
     "check_rc_max_too_high": ("remote control's channel {0}: maximum is above {1}", "BH"),
     "check_rc_min_too_small": ("remote control's channel {0}: minimum is below {1}", "BH"),
@@ -168,7 +168,7 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "check_ram_usage_too_high": ("autopilot's memory is full at {0:.0f} %", "f"),
     "check_missing_cpuload": "autopilot's load is not known",
     "check_missing_fmu_sdcard": "autopilot's SD card is missing",
-    "check_hardfault_present": "the autopilot crashed before: look at its SD card",
+    "check_hardfault_present": "the autopilot crashed earlier: check its SD card",
     "check_system_safety_button": "the safety button must be pressed",
     "check_system_usb_connected": "USB is plugged in",
     "check_system_arm_auth_failed": "arming is not authorized",
@@ -177,12 +177,12 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "check_system_no_home_pos": "home is required",
     "check_modes_home_position": "home is not known",
     "check_modes_mission": "the autopilot has no mission",
-    "check_modes_cannot_takeoff": "it is not armed in this mode",
+    "check_modes_cannot_takeoff": "it does not arm in this mode",
     "check_mission_failure": "the autopilot's mission cannot be flown",
     "check_navigator_failure_hagl": "waypoint is too high",
     "check_external_modes_unavailable": "an external mode is not registered",
     "check_external_modes_unresponsive": "an external mode does not answer",
-    "check_flight_time_limit": "longest flight time is over",
+    "check_flight_time_limit": "the longest flight time is over",
     "check_gf_no_home": "the fence's return needs home",
     "check_gf_violation": ("PX4's fence: {0}", "G"),
     "check_gf_violation_custom_gf": "PX4's fence: at or beyond it",
@@ -195,7 +195,7 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "check_wind_too_high": ("wind is too strong: {0:.1f} m/s", "f"),
     "check_high_wind_warning": ("wind is strong: {0:.1f} m/s", "f"),
     "check_above_wind_limits_warning": ("wind is too strong: {0:.1f} m/s", "f"),
-    # What it refuses
+    # Refusals
     "commander_arm_denied_calibrating": "it is being calibrated",
     "commander_arm_denied_not_manual": "it must be in a manual mode",
     "commander_arm_denied_resolve_failures": "its checks fail",
@@ -203,9 +203,9 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "commander_arm_denied_throttle_high": "throttle is not down",
     "commander_disarm_denied_not_landed": "it has not landed",
     "commander_disarming_denied_not_landed": "it has not landed",
-    "commander_modeswitch_not_avail": "it cannot fly in the mode that was asked for",
+    "commander_modeswitch_not_avail": "it cannot fly in the requested mode",
     "commander_transition_denied": "it cannot be armed or disarmed now",
-    # What it does
+    # Actions
     "commander_failsafe_enter": ("failsafe, {2}: PX4 {1}", "IAC"),
     "commander_failsafe_enter_hold": ("failsafe, {3}: PX4 holds for {2} s, then {1}", "IAHC"),
     "commander_failsafe_enter_warn": ("failsafe, {1}: PX4 does nothing", "IC"),
@@ -229,7 +229,7 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "commander_rc_lost": "remote control lost",
     "commander_rc_loss_act": "PX4 acts on a lost remote control",
     "commander_gcs_lost": "ground station lost",
-    "commander_mission_comp_lost": "this program was silent",
+    "commander_mission_comp_lost": "no setpoints came from this program",
     "commander_open_drone_id_lost": "remote ID is lost",
     "commander_remote_id_lost": "remote ID is lost",
     "commander_max_flight_time_warning_minutes": ("PX4 returns in {0} minutes", "h"),
@@ -239,20 +239,20 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "navigator_geofence_invalid_against_home": "PX4's fence does not contain home",
     "navigator_geofence_max_alt_from_home": ("PX4's fence: more than {0:.0f} m above home", "f"),
     "navigator_geofence_max_dist_from_home": ("PX4's fence: more than {0:.0f} m from home", "f"),
-    "navigator_change_altitude_outside_geofence": "a height outside PX4's fence was asked for",
-    "navigator_reposition_outside_geofence": "a place outside PX4's fence was asked for",
-    "navigator_fail_max_hagl": "a height above the highest that it may fly at was asked for",
-    "navigator_takeoff_already_higher": "it is above its takeoff height already",
+    "navigator_change_altitude_outside_geofence": "the requested height is outside PX4's fence",
+    "navigator_reposition_outside_geofence": "the requested place is outside PX4's fence",
+    "navigator_fail_max_hagl": "the requested height is above the highest allowed",
+    "navigator_takeoff_already_higher": "it is already above its takeoff height",
     "navigator_terrain_collision_risk": "the ground is near: PX4 stops its descent",
-    "orbit_radius_exceeded": "an orbit that is too wide was asked for",
+    "orbit_radius_exceeded": "the requested orbit is too wide",
     "mc_throw_launch_ready": "it starts when thrown",
     "mc_throw_launch_not_ready": "it is disarmed, and does not start when thrown",
     "commander_mode_fallback_internal": "an external mode does not answer: PX4 flies its own",
     "commander_high_latency_lost": "the high-latency link is lost",
     "commander_ctrl_high_latency_failed": "the high-latency link cannot be switched",
-    "commander_unsupported_auto_mode": "a mode that it does not have was asked for",
-    "commander_unsupported_arm_disarm_param": "arming was asked for by an unknown value",
-    # What it sets by itself, since one parameter does not suit another
+    "commander_unsupported_auto_mode": "the requested mode does not exist",
+    "commander_unsupported_arm_disarm_param": "arming was requested with an unknown value",
+    # Parameters that PX4 changes because they do not fit others
     "mc_pos_ctrl_tilt_set": ("PX4 set MPC_TILTMAX_AIR to {0:.0f} degrees: more is not safe", "f"),
     "mc_pos_ctrl_land_tilt_set": (
         "PX4 set MPC_TILTMAX_LND to {0:.0f} degrees, which is MPC_TILTMAX_AIR", "f",
@@ -295,32 +295,32 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "commander_airmode_requires_no_arm_gesture": (
         "MC_AIRMODE with yaw does not go with arming by the sticks (MAN_ARM_GESTURE)"
     ),
-    # What fails on the ground, or beside the flight
+    # Faults on the ground, or without effect on the flight
     "commander_load_param_failed": "its settings could not be loaded",
     "commander_save_param_failed": "its settings could not be saved",
     "commander_cal_cmd_denied": "it is being calibrated, and refused a command",
-    "commander_cal_no_inputs": "no sticks are heard to calibrate them",
+    "commander_cal_no_inputs": "no stick input arrives to calibrate",
     "commander_cal_trim_param_set_failed": "the sticks' trim could not be saved",
-    "commander_esc_calibration_denied": "motor controllers are not calibrated now",
-    "logger_storage_full": ("PX4 does not log: {0} MiB are left", "I"),
+    "commander_esc_calibration_denied": "motor controllers cannot be calibrated now",
+    "logger_storage_full": ("PX4 does not log: {0} MiB are free", "I"),
     "mavlink_log_not_enough_bw": ("the link is too slow to send PX4's log: {0} B/s", "I"),
-    "mavlink_param_rc_chan_out_of_bounds": "a parameter was mapped to a channel that is not there",
-    "col_prev_unsup_frame": ("obstacles came in a frame that it does not know ({0})", "B"),
+    "mavlink_param_rc_chan_out_of_bounds": "a parameter was mapped to a missing channel",
+    "col_prev_unsup_frame": ("obstacles arrived in an unknown frame ({0})", "B"),
     "mavlink_rcv_lnd_target_unsup_coord": (
-        "a landing target came in a frame that it does not know ({0})", "B",
+        "a landing target arrived in an unknown frame ({0})", "B",
     ),
     "mavlink_rcv_odom_unsup_estimator_type": (
-        "odometry came from an estimator that it does not know ({0})", "B",
+        "odometry arrived from an unknown estimator ({0})", "B",
     ),
     "mavlink_rcv_sp_target_unsup_coord": (
-        "a setpoint came in a frame that it does not know ({0})", "B",
+        "a setpoint arrived in an unknown frame ({0})", "B",
     ),
     "mavlink_rcv_sp_target_gl_invalid_coord": (
-        "a setpoint came in a frame that it does not know ({0})", "B",
+        "a setpoint arrived in an unknown frame ({0})", "B",
     ),
-    "mavlink_rcv_sp_target_invalid": "a setpoint came without position, velocity and acceleration",
-    "mavlink_rcv_sp_target_unsup_force": "a setpoint of a force came: it knows none",
-    "mavlink_rcv_sp_target_gl_unsup_force": "a setpoint of a force came: it knows none",
+    "mavlink_rcv_sp_target_invalid": "a setpoint had no position, velocity or acceleration",
+    "mavlink_rcv_sp_target_unsup_force": "setpoints of a force are not supported",
+    "mavlink_rcv_sp_target_gl_unsup_force": "setpoints of a force are not supported",
     "px4io_comm_failed": "its input-output processor does not answer",
     "px4io_config_read_failed": "its input-output processor does not answer",
     "px4io_io_rc_config_upload_failed": "its input-output processor does not take its settings",
@@ -332,8 +332,8 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "pps_capture_pps_rate_exceeded": "GPS's pulse per second is faulty",
 }  # fmt: skip
 
-# Missions of PX4's own are none of this program's, and their faults alike to whoever reads of them.
-_OF_MISSIONS = {
+# This program uses no PX4 missions, so their faults share a few texts.
+_MISSION_WORDS = {
     "a mission that somebody sent to PX4 cannot be flown": (
         "feasibility_mis_in_air_landing_req mission_do_jump_cycle mission_index_out_of_bound "
         "mission_invalid_mission_state mission_item_set_failed mission_not_valid_loiter "
@@ -353,7 +353,7 @@ _OF_MISSIONS = {
         "navigator_mis_wp_below_home navigator_mis_wp_gate_too_close "
         "navigator_mission_failure_heading rtl_unsupported_mav_frame"
     ),
-    "PX4 could not read or keep its mission": (
+    "PX4 could not read or store its mission": (
         "mavlink_mission_err_id mavlink_mission_storage_failure "
         "mavlink_mission_storage_read_failure mavlink_mission_storage_write_failure "
         "mavlink_mission_storage_write_failure2 mavlink_mission_storage_write_failure3 "
@@ -373,13 +373,13 @@ _OF_MISSIONS = {
         "mavlink_mission_wp_unexpected mavlink_mission_wp_unexpected2"
     ),
 }
-_WORDS |= {name: text for text, names in _OF_MISSIONS.items() for name in names.split()}
+_WORDS |= {name: text for text, names in _MISSION_WORDS.items() for name in names.split()}
 
 _AUTOPILOT = 1
 
 
 def event_id(name: str) -> int:
-    """An event of PX4's own, by its name: component 1, and 24 bits of the name's FNV-1a hash."""
+    """Id of a PX4 event: component 1, and 24 bits of the name's FNV-1a hash."""
     value = 0x811C9DC5
     for byte in name.encode():
         value = (value ^ byte) * 0x01000193 & 0xFFFFFFFF
@@ -390,7 +390,7 @@ _NAMES = {event_id(name): name for name in _WORDS}
 _REPORT_BEGINS = event_id("commander_arming_check_summary")
 _REPORT_ENDS = event_id("commander_health_summary")
 
-# The modes that a check names, and those that may be armed, are bits.
+# A check's modes, and the modes in which PX4 can arm, are bit masks.
 _MODES_AND_COMPONENT = "<IB"
 _SUMMARY = "<BIIII"
 _ALL_MODES = 0xFFFFFFFF
@@ -400,29 +400,29 @@ _BITS = {
 }  # fmt: skip
 
 _SEQUENCES = 1 << 16
-# PX4 queues fewer.
+# More than PX4 queues.
 _MOST_CHECKS = 32
-# PX4 keeps its last 20 events, and answers at once for those that it has.
+# PX4 keeps its last 20 events, and sends requested ones at once.
 _ANSWER_S = 2.0
 
 
 class _Check(NamedTuple):
-    """One check that fails: in which modes (bits), and how grave it is (0 is the gravest)."""
+    """A failed check; `modes` is a bit mask, `level` a MAVLink severity, 0 the most severe."""
 
     modes: int
     level: int
     reason: AutopilotReason
 
 
-class _Told(NamedTuple):
-    """An event that is told once."""
+class _Warning(NamedTuple):
+    """Warning from a single event, outside the reports."""
 
     at_s: float
     reason: AutopilotReason
 
 
 class Px4Events:
-    """State of one vehicle's events. Times are the robot's monotonic clock, s."""
+    """State of one vehicle's events. Times are by the robot's monotonic clock, s."""
 
     def __init__(self) -> None:
         self._last: int | None = None
@@ -431,14 +431,14 @@ class Px4Events:
         self._report: list[_Check] | None = None
         self._can_arm = self._report_can_arm = 0
         self._checks: tuple[_Check, ...] = ()
-        # What `wrong` made of them, by the mode.
-        self._wrong: dict[Mode | None, tuple[AutopilotReason, ...]] = {}
-        self._told: deque[_Told] = deque(maxlen=16)
+        # Cache of `present_faults`.
+        self._faults: dict[Mode | None, tuple[AutopilotReason, ...]] = {}
+        self._warnings: deque[_Warning] = deque(maxlen=16)
 
-    def hear(self, fields: Mapping[str, Any], now_s: float) -> None:
-        """Take in one EVENT; one that overtook another must be sent again, see `missing`.
+    def receive(self, fields: Mapping[str, Any], now_s: float) -> None:
+        """Process an EVENT. One that arrives before its predecessor must be sent again: `missing`.
 
-        Raises KeyError, TypeError or ValueError for what is no EVENT.
+        Raises KeyError, TypeError or ValueError for an invalid one.
         """
         sequence, event, level = fields["sequence"], fields["id"], fields["log_levels"] & 0xF
         arguments = bytes(fields["arguments"]).ljust(40, b"\0")
@@ -450,7 +450,7 @@ class Px4Events:
             if self._report is not None:
                 self._can_arm = self._report_can_arm
                 self._checks = tuple(sorted(self._report, key=lambda check: check.level))
-                self._wrong.clear()
+                self._faults.clear()
             self._report = None
         elif self._report is not None and _NAMES.get(event, "check_").startswith("check_"):
             modes = struct.unpack_from(_MODES_AND_COMPONENT, arguments)[0]
@@ -458,50 +458,50 @@ class Px4Events:
             if len(self._report) < _MOST_CHECKS:
                 self._report.append(_Check(modes, level, to_reason(event, rest)))
         elif level <= _WARNING:
-            self._told.append(_Told(now_s, to_reason(event, arguments)))
+            self._warnings.append(_Warning(now_s, to_reason(event, arguments)))
 
-    def hear_sequence(self, fields: Mapping[str, Any], now_s: float) -> None:
-        """Take in a CURRENT_EVENT_SEQUENCE: the newest event may have been lost."""
+    def receive_sequence(self, fields: Mapping[str, Any], now_s: float) -> None:
+        """Process a CURRENT_EVENT_SEQUENCE, which shows whether the newest event was lost."""
         newest = fields["sequence"]
         if self._last is None or _ahead(newest, self._last) >= _SEQUENCES // 2:
-            # The vehicle was switched on anew.
-            self._start_at(newest)
+            # The first message, or the vehicle has restarted.
+            self._last, self._missing_since_s, self._report = newest, None, None
         else:
             self._is_next(newest, now_s, arrived=False)
 
     def missing(self) -> tuple[int, int] | None:
-        """The first and last sequence number of what REQUEST_EVENT must ask for."""
+        """First and last sequence number for REQUEST_EVENT; None if no event is missing."""
         if self._last is None or self._missing_since_s is None:
             return None
         return (self._last + 1) % _SEQUENCES, self._newest
 
-    def why_not_armed(self, mode: Mode | None) -> tuple[AutopilotReason, ...]:
-        """Why PX4 would not arm in this mode, the gravest first, by its last report."""
+    def arming_problems(self, mode: Mode | None) -> tuple[AutopilotReason, ...]:
+        """Reasons of the last report not to arm in this mode, most severe first."""
         bits = _bits(mode)
         if self._can_arm & bits == bits:
             return ()
         checks = [check for check in self._checks if check.modes & bits]
         errors = [check for check in checks if check.level <= _ERROR]
-        # Some that are less grave keep it from arming, too; most only warn.
+        # Without errors, less severe checks prevent arming; usually they only warn.
         return _reasons(errors or checks)
 
-    def told(self, since_s: float) -> tuple[AutopilotReason, ...]:
-        """Warnings of PX4 since then that are told once, the newest first."""
-        if not self._told or self._told[-1].at_s < since_s:
+    def warnings(self, since_s: float) -> tuple[AutopilotReason, ...]:
+        """Single warnings since then, newest first."""
+        if not self._warnings or self._warnings[-1].at_s < since_s:
             return ()
-        recent = takewhile(lambda told: told.at_s >= since_s, reversed(self._told))
+        recent = takewhile(lambda warning: warning.at_s >= since_s, reversed(self._warnings))
         return _reasons(recent)
 
-    def wrong(self, mode: Mode | None) -> tuple[AutopilotReason, ...]:
-        """Present problems, as PX4 finds them, that concern this mode, the gravest first."""
-        if mode not in self._wrong:
+    def present_faults(self, mode: Mode | None) -> tuple[AutopilotReason, ...]:
+        """Failed checks of the last report that concern this mode, most severe first."""
+        if mode not in self._faults:
             bits = _bits(mode)
-            grave = (c for c in self._checks if c.level <= _WARNING and c.modes & bits)
-            self._wrong[mode] = _reasons(grave)
-        return self._wrong[mode]
+            severe = (c for c in self._checks if c.level <= _WARNING and c.modes & bits)
+            self._faults[mode] = _reasons(severe)
+        return self._faults[mode]
 
     def _is_next(self, sequence: int, now_s: float, *, arrived: bool = True) -> bool:
-        """Whether the event with that number comes next; if not, what lies between is missing."""
+        """Whether this event comes next; if not, those in between are missing."""
         ahead = 1 if self._last is None else _ahead(sequence, self._last)
         given_up = self._missing_since_s is not None and now_s - self._missing_since_s > _ANSWER_S
         if (ahead == 1 and arrived) or (given_up and 0 < ahead < _SEQUENCES // 2):
@@ -517,18 +517,13 @@ class Px4Events:
                 self._missing_since_s = now_s
         return False
 
-    def _start_at(self, sequence: int) -> None:
-        self._last, self._missing_since_s, self._report = sequence, None, None
-
 
 def to_reason(event: int, arguments: bytes) -> AutopilotReason:
-    """An event in words; `arguments` are those that it shows, after a check's modes."""
+    """Convert an event to a reason; `arguments` are those after a check's modes."""
     name = _NAMES.get(event)
     if name is None:
         code = f"0x{event:08x}"
-        return AutopilotReason(
-            code, (), f"a reason that this program has no words for: event {code}"
-        )
+        return AutopilotReason(code, (), f"event {code}, which this program does not know")
     words = _WORDS[name]
     text, types = (words, "") if isinstance(words, str) else words
     values = struct.unpack_from("<" + re.sub("[ACSG]", "B", types), arguments)
@@ -540,7 +535,7 @@ def to_reason(event: int, arguments: bytes) -> AutopilotReason:
 
 
 def without_repetition(reasons: Iterable[AutopilotReason]) -> tuple[AutopilotReason, ...]:
-    """In the same order; of those that read alike, the first."""
+    """Drop reasons with the text of an earlier one."""
     first: dict[str, AutopilotReason] = {}
     for reason in reasons:
         first.setdefault(reason.text, reason)
@@ -555,5 +550,5 @@ def _bits(mode: Mode | None) -> int:
     return 1 << _BITS[mode] if mode in _BITS else _ALL_MODES
 
 
-def _reasons(entries: Iterable[_Check | _Told]) -> tuple[AutopilotReason, ...]:
+def _reasons(entries: Iterable[_Check | _Warning]) -> tuple[AutopilotReason, ...]:
     return without_repetition(entry.reason for entry in entries)

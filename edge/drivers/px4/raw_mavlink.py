@@ -1,7 +1,7 @@
-"""The few MAVLink frames that are spoken and heard without a MAVLink library.
+"""Encoder and parser of the few MAVLink frames that are used without a MAVLink library.
 
-For Python 3.6 and newer, and the standard library alone: the watchdog loads nothing else, and
-`fleet` sends this file to the robot's own Python.
+Needs Python 3.6 and its standard library only: the watchdog loads nothing else, and `lpac fleet`
+sends this file to the robot's own Python.
 """
 
 import struct
@@ -27,7 +27,7 @@ _AUTO_MODES = {2: "takeoff", 3: "hold", 4: "mission", 5: "return", 6: "land"}
 
 
 class Heartbeat(NamedTuple):
-    """An autopilot's HEARTBEAT: `autopilot` is MAVLink's MAV_AUTOPILOT, `mode` the mode's name."""
+    """An autopilot's HEARTBEAT; `autopilot` is a MAV_AUTOPILOT, `mode` the mode's name."""
 
     system_id: int
     autopilot: int
@@ -36,19 +36,19 @@ class Heartbeat(NamedTuple):
 
 
 def mode_name(custom_mode: int) -> str:
-    """Name of PX4's custom mode; "other" for one that nobody needs to tell apart."""
+    """Name of PX4's custom mode; "other" for modes that no caller distinguishes."""
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     return (_AUTO_MODES.get(sub) if main == _AUTO else _MAIN_MODES.get(main)) or "other"
 
 
 def hold_command(sequence: int, system_id: int, component_id: int) -> bytes:
-    """PX4's hold mode; `system_id` is the vehicle's, `component_id` the sender's."""
+    """Command for PX4's hold mode; `system_id` is the vehicle's, `component_id` the sender's."""
     return _command(sequence, system_id, component_id, _DO_SET_MODE, _CUSTOM_MODE, _MAIN_AUTO,
                     _SUB_HOLD)  # fmt: skip
 
 
 def land_command(sequence: int, system_id: int, component_id: int) -> bytes:
-    """A landing where the vehicle is."""
+    """Command to land at the present place."""
     return _command(sequence, system_id, component_id, _NAV_LAND)
 
 
@@ -66,7 +66,7 @@ def _command(
 
 
 def _crc(data: bytes) -> int:
-    """CRC-16/MCRF4XX, as MAVLink has it."""
+    """MAVLink's checksum, CRC-16/MCRF4XX."""
     crc = 0xFFFF
     for byte in data:
         mixed = byte ^ (crc & 0xFF)
@@ -76,7 +76,7 @@ def _crc(data: bytes) -> int:
 
 
 class RawFrame(NamedTuple):
-    """One MAVLink frame: `number` counts those of a link, `content` is all of it."""
+    """One MAVLink frame; `number` is its sequence number, `content` the whole frame."""
 
     system_id: int
     component_id: int
@@ -87,7 +87,7 @@ class RawFrame(NamedTuple):
 
 
 def frames(data: bytes) -> Iterator[RawFrame]:
-    """A datagram's frames, up to the first that is none."""
+    """Yield a datagram's frames, up to the first invalid one."""
     while len(data) >= 8:
         if data[0] == 0xFD:  # MAVLink 2
             size, header = data[1], 10
@@ -110,10 +110,10 @@ def frames(data: bytes) -> Iterator[RawFrame]:
 
 
 def heartbeat(data: bytes) -> Optional[Heartbeat]:
-    """The first heartbeat of an autopilot among a datagram's messages, None if there is none."""
+    """First heartbeat of an autopilot in a datagram; None if there is none."""
     for frame in frames(data):
         if frame.message_id == _HEARTBEAT and frame.component_id == _AUTOPILOT:
-            # Trailing zeros are left out of a MAVLink 2 payload.
+            # MAVLink 2 leaves out trailing zeros.
             payload = frame.payload.ljust(9, b"\0")
             custom_mode, _, autopilot, base_mode, _, _ = struct.unpack("<IBBBBB", payload[:9])
             return Heartbeat(

@@ -1,6 +1,6 @@
-"""PX4's telemetry as one `VehicleState`: MAVLink messages in; no socket, thread or clock.
+"""PX4's telemetry: MAVLink messages -> `VehicleState`. No socket, thread or clock.
 
-Messages come as MAVLink's common dialect names them, with their fields in MAVLink's units.
+Messages have the names, fields and units of MAVLink's common dialect.
 """
 
 import math
@@ -29,39 +29,39 @@ from edge.drivers.px4.raw_mavlink import mode_name
 
 Fields = Mapping[str, Any]
 
-# Message -> how often PX4 shall send it, Hz. HEARTBEAT is not among them: PX4 keeps that at 1 Hz.
+# Message -> requested rate, Hz. PX4 sends HEARTBEAT at 1 Hz, whatever is requested.
 RATES_HZ = {
     1: 5.0,  # SYS_STATUS
-    24: 10.0,  # GPS_RAW_INT: the sooner one that repeats itself is noticed
+    24: 10.0,  # GPS_RAW_INT: so that a stuck receiver is noticed soon
     32: 20.0,  # LOCAL_POSITION_NED
     33: 5.0,  # GLOBAL_POSITION_INT
-    49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
+    49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds the delay
     74: 5.0,  # VFR_HUD: thrust
-    230: 5.0,  # ESTIMATOR_STATUS: at less, one with a doubt would stop a robot
+    230: 5.0,  # ESTIMATOR_STATUS: at a lower rate, a single glitch would stop a robot
     245: 5.0,  # EXTENDED_SYS_STATE
 }
-# Whatever it says, it is there; but after a silence, and without a heartbeat for long, its mode is
-# not known. PX4 sends one every second, and when it is asked.
+# Any message shows that the vehicle is connected. Its mode is unknown after a silence of the first
+# duration, and without a heartbeat for the second. PX4 sends one every second, and on request.
 _CONNECTED_WITHIN_S, _HEARTBEAT_WITHIN_S = 2.5, 10.0
 _TWIN_WITHIN_S = 5.0
-# Asked for five times a second; what is older says nothing about now.
-_SYS_STATUS_HEARD_S = 2.5
-_THRUST_HEARD_S = 2.5
-# What is told once counts for so long, and as long as a failsafe lasts.
-_TOLD_FOR_S = 15.0
-# The reason for a failsafe comes up to a heartbeat before its state.
+# Requested at 5 Hz; older values say nothing about the present.
+_SYS_STATUS_VALID_S = 2.5
+_THRUST_VALID_S = 2.5
+# A single warning counts for this time, and as long as a failsafe lasts.
+_WARNING_VALID_S = 15.0
+# The reason for a failsafe precedes its state by up to a heartbeat.
 _FAILSAFE_LATE_S = 2.5
 
-# A position is taken for a jump if it lies further from where motion led than this, plus as much
-# for every second between.
+# A position has jumped if it differs from the extrapolated one by more than this, plus as much for
+# each second in between.
 _JUMP_M, _JUMP_M_S = 1.0, 1.0
 _ORIGIN_ANSWER_S = 0.5
-# Who lands says so for longer before it is disarmed: PX4 waits for COM_DISARM_LAND, 2 s.
+# PX4 reports a landing for COM_DISARM_LAND, 2 s, before it disarms: at least this long.
 _LANDED_BEFORE_S = 0.3
-# After a longer silence, nobody knows what of a jump in height was motion.
+# After a longer silence, motion and a jump in height cannot be told apart.
 _HEIGHT_JUMP_WITHIN_S = 1.0
 
-# Present says which sensors there are; of PREARM_CHECK PX4 tells in health alone.
+# PX4 reports PREARM_CHECK in the health bits only, not among the sensors present.
 _SENSOR_RC, _PREARM_CHECK = 1 << 16, 1 << 28
 _VELOCITY_HORIZ, _POS_HORIZ_ABS, _GPS_GLITCH = 1 << 1, 1 << 4, 1 << 10
 _SAFETY_ARMED = 1 << 7
@@ -71,53 +71,52 @@ _WARNING = 4
 _ON_GROUND = 1
 _UNKNOWN_UINT16 = 0xFFFF
 _FIX_3D = 3
-# What PX4's estimator takes from a receiver by default: place, height and velocity.
+# PX4's default of EKF2_GPS_CTRL, 7: horizontal position, height and velocity.
 _ALL_OF_GPS: float = struct.unpack("<f", struct.pack("<i", 7))[0]
-# How long a receiver's slip counts: an echo passes, and a drift of 0.5 m/s comes to 5 m.
+# Time constant of a receiver's slip: short multipath errors fade, and a drift of 0.5 m/s adds up
+# to 5 m.
 _SLIP_S = 10.0
-# After a longer pause nobody knows how the receiver moved.
+# After a longer pause the receiver's movement is unknown.
 _SLIP_WITHIN_S, _SLIP_JUMP_M = 1.0, 3.0
-_M_PER_DEG = 111_195.0  # of latitude: a sphere is good enough for differences of metres
+_M_PER_DEG = 111_195.0  # of latitude, on a sphere, accurate enough for differences of metres
 _REFUSAL = re.compile(r"^(?:\w+ denied|preflight fail)[:!]?\s*", re.IGNORECASE)
 
 
 class Px4Telemetry:
-    """The newest of everything that one vehicle said. Every method may be called from any thread.
+    """The newest known state of one vehicle. Thread-safe.
 
-    Times are the robot's monotonic clock, s.
+    Times are by the robot's monotonic clock, s. Messages that were held up by this process or the
+    link arrive together. The vehicle's own clock shows their age, so that `position_at_s` and
+    `heartbeat_at_s` are the times at which they were due.
 
-    Messages that were held up, because this process or the link stood still, arrive in one go: the
-    vehicle's own clock tells how old they are, and `position_at_s` and `heartbeat_at_s` count from
-    when they were due.
+    Position and origin always belong together. A position that jumps is withheld until the origin
+    has been received again, for at most 0.5 s. A new origin applies from the next position on.
 
-    `messages` are the names of those that `hear` understands.
-
-    Position and origin always belong together. A position that jumps is held back until the origin
-    is known anew, half a second at most, and a new origin counts from the next position on.
+    `messages` are the names of the messages that `receive` processes.
     """
 
     def __init__(self) -> None:
         self._lock = Lock()
-        # The fields of a `VehicleState` in the making.
-        self._heard = SimpleNamespace(**asdict(VehicleState()))
-        # What was made of it last, unless it has changed since: with which other fields.
-        self._told: tuple[dict[str, Any], VehicleState] | None = None
+        # Fields of the `VehicleState`.
+        self._newest = SimpleNamespace(**asdict(VehicleState()))
+        # The last state and its other fields; None after a change.
+        self._cached: tuple[dict[str, Any], VehicleState] | None = None
         self._clock = _VehicleClock()
         self._hardware_at_s: dict[tuple[int, ...], float] = {}
-        self._alive_at_s = self._heard_from_s = -math.inf
+        self._alive_at_s = self._alive_since_s = -math.inf
         self._sys_status_at_s = self._thrust_at_s = -math.inf
-        # Since it was armed: when it last said that it is in the air, and first that it landed; and
-        # whether it had not said so by the time that it was disarmed.
+        # Since arming: the last report to be in the air, and the first after it of a landing.
         self._in_air_at_s = self._landed_at_s = -math.inf
-        # By the vehicle's own clock: what was held up on its way comes in one go.
+        # By the vehicle's clock, since held-up messages arrive together.
         self._boot_s = self._landed_at_boot_s = 0.0
+        # The last disarming was not preceded by a report of a landing.
         self._disarmed_aloft = False
         self._fix: _Fix | None = None
         self._gps_time_us: int | None = None
         self._jump_at_s: float | None = None
         self._origin: GlobalOrigin | None = None
         self._origin_at_s = -math.inf
-        # What EKF2_GPS_CTRL was before the receiver was ignored.
+        # EKF2_GPS_CTRL before the receiver was ignored.
         self.gps_control = _ALL_OF_GPS
         self._texts: deque[tuple[float, str]] = deque(maxlen=16)
         self._events = Px4Events()
@@ -135,122 +134,120 @@ class Px4Telemetry:
             "PARAM_VALUE": self._on_param_value,
             "VFR_HUD": self._on_vfr_hud,
             "STATUSTEXT": self._on_statustext,
-            "EVENT": self._events.hear,
-            "CURRENT_EVENT_SEQUENCE": self._events.hear_sequence,
+            "EVENT": self._events.receive,
+            "CURRENT_EVENT_SEQUENCE": self._events.receive_sequence,
             "AUTOPILOT_VERSION": self._on_autopilot_version,
             "MISSION_CURRENT": self._on_mission_current,
         }
         self.messages = tuple(self._handlers)
 
-    def hear(self, name: str, fields: Fields, now_s: float) -> None:
-        """Take in one message of the autopilot.
+    def receive(self, name: str, fields: Fields, now_s: float) -> None:
+        """Process one message of the autopilot.
 
-        Raises KeyError, TypeError or ValueError for one that is no such message: nothing changes.
+        Raises KeyError, TypeError or ValueError for an invalid one; nothing changes then.
         """
         with self._lock:
             self._handlers[name](fields, now_s)
             at_s = now_s - self._clock.delay_s
             if at_s - self._alive_at_s > _CONNECTED_WITHIN_S:
-                self._heard_from_s = at_s
+                self._alive_since_s = at_s
             self._alive_at_s = at_s
 
     def state(self, now_s: float, **of_link: Any) -> VehicleState:
-        """The newest of everything; `of_link` are the fields that are not known here.
+        """The newest state; `of_link` are the fields of the link and of commands.
 
-        Those are the system ids and what came of commands. As long as nothing changes, it is the
-        same object.
+        Returns the same object until something changes.
         """
         with self._lock:
-            heard = self._heard
+            newest = self._newest
             is_alive = now_s - self._alive_at_s < _CONNECTED_WITHIN_S
-            mode_known_s = max(self._heard_from_s, now_s - _HEARTBEAT_WITHIN_S)
-            knows_mode = heard.heartbeat_at_s >= mode_known_s
+            mode_known_s = max(self._alive_since_s, now_s - _HEARTBEAT_WITHIN_S)
+            knows_mode = newest.heartbeat_at_s >= mode_known_s
             fields = of_link | {"connected": is_alive and knows_mode}
-            armable = heard.armable
-            if now_s - self._sys_status_at_s > _SYS_STATUS_HEARD_S:
+            armable = newest.armable
+            if now_s - self._sys_status_at_s > _SYS_STATUS_VALID_S:
                 armable = None
                 fields |= dict.fromkeys(("armable", "battery", "voltage_v", "remote_control"))
-            if now_s - self._thrust_at_s > _THRUST_HEARD_S:
+            if now_s - self._thrust_at_s > _THRUST_VALID_S:
                 fields["thrust"] = None
-            if heard.armed:
-                told = self._events.told(self._told_since_s(now_s))
-                wrong = self._events.wrong(heard.mode)
-                fields["warnings"] = without_repetition((*told, *wrong)) if told else wrong
+            if newest.armed:
+                warnings = self._events.warnings(self._warnings_since_s(now_s))
+                present = self._events.present_faults(newest.mode)
+                fields["warnings"] = (
+                    without_repetition((*warnings, *present)) if warnings else present
+                )
             elif not armable:
-                fields["problems"] = self._why_not_armed(now_s - _TOLD_FOR_S)
-            if self._told is None or self._told[0] != fields:
-                self._told = fields, VehicleState(**vars(heard) | fields)
-            return self._told[1]
+                fields["problems"] = self._arming_problems(now_s - _WARNING_VALID_S)
+            if self._cached is None or self._cached[0] != fields:
+                self._cached = fields, VehicleState(**vars(newest) | fields)
+            return self._cached[1]
 
     def needs_origin(self) -> bool:
-        """Whether the position jumped, and an origin that is as new has not come yet."""
+        """Whether the position has jumped and the origin has not been received since."""
         return self._jump_at_s is not None
 
     def has_twin(self, now_s: float) -> bool:
-        """Whether two vehicles speak with the same system id, by their hardware ids.
+        """Whether two vehicles use the same system id, by their hardware ids.
 
-        Some boards have theirs all in common.
+        Some boards all have the same hardware id.
         """
         with self._lock:
             since_s = now_s - _TWIN_WITHIN_S
             return sum(at_s > since_s for at_s in self._hardware_at_s.values()) > 1
 
     def restarts(self) -> int:
-        """How often the vehicle was found to have been switched on anew."""
+        """Number of detected restarts of the vehicle."""
         with self._lock:
             return self._clock.restarts
 
     def fence_id(self, since_s: float) -> int | None:
-        """The id of PX4's fence as told since then, 0 for none; None: not told since."""
+        """Id of PX4's fence received since then, 0 without a fence; None if none was received."""
         with self._lock:
             fence_id, at_s = self._fence
             return fence_id if at_s >= since_s else None
 
     def missing_events(self) -> tuple[int, int] | None:
-        """The first and last sequence number of events that were lost and are to be asked for."""
+        """First and last sequence number of lost events; None if none are missing."""
         with self._lock:
             return self._events.missing()
 
     def refusal_reasons(self, since_s: float) -> tuple[AutopilotReason, ...]:
-        """Why a command that was sent then was refused: what was told since, and is wrong now."""
+        """Reasons for the refusal of a command sent then: warnings since, and present problems."""
         with self._lock:
-            told = self._events.told(since_s)
-            return without_repetition((*told, *self._why_not_armed(since_s)))
+            warnings = self._events.warnings(since_s)
+            return without_repetition((*warnings, *self._arming_problems(since_s)))
 
-    def _told_since_s(self, now_s: float) -> float:
-        """When what is told once must have been told to count now."""
-        since_s = now_s - _TOLD_FOR_S
-        return (
-            min(since_s, self._failsafe_at_s - _FAILSAFE_LATE_S)
-            if self._heard.failsafe
-            else since_s
-        )
+    def _warnings_since_s(self, now_s: float) -> float:
+        since_s = now_s - _WARNING_VALID_S
+        if self._newest.failsafe:
+            return min(since_s, self._failsafe_at_s - _FAILSAFE_LATE_S)
+        return since_s
 
-    def _why_not_armed(self, since_s: float) -> tuple[AutopilotReason, ...]:
-        """By PX4's checks; a vehicle that does not tell them may have said it in a text."""
+    def _arming_problems(self, since_s: float) -> tuple[AutopilotReason, ...]:
+        """Problems by PX4's checks; without these, by texts received since then."""
         texts = {text: None for at_s, text in self._texts if at_s >= since_s}
-        said = tuple(AutopilotReason("text", (), text) for text in texts)
-        return self._events.why_not_armed(self._heard.mode) or said
+        by_text = tuple(AutopilotReason("text", (), text) for text in texts)
+        return self._events.arming_problems(self._newest.mode) or by_text
 
     def _change(self, **changes: Any) -> None:
-        vars(self._heard).update(changes)
-        self._told = None
+        vars(self._newest).update(changes)
+        self._cached = None
 
     def _on_heartbeat(self, fields: Fields, now_s: float) -> None:
         if fields["autopilot"] == _AUTOPILOT_INVALID:
             return
         failsafe = fields["system_status"] in (_CRITICAL, _EMERGENCY)
-        if failsafe and not self._heard.failsafe:
+        if failsafe and not self._newest.failsafe:
             self._failsafe_at_s = now_s
         armed = bool(fields["base_mode"] & _SAFETY_ARMED)
-        if armed and not self._heard.armed:
+        if armed and not self._newest.armed:
             self._in_air_at_s = self._landed_at_s = -math.inf
             self._change(height_jumped_m=0.0, fell=False)
-        elif self._heard.armed and not armed:
+        elif self._newest.armed and not armed:
             landed_s = max(now_s - self._landed_at_s, self._boot_s - self._landed_at_boot_s)
             landed = self._landed_at_s > -math.inf and landed_s >= _LANDED_BEFORE_S
             self._disarmed_aloft = self._in_air_at_s > -math.inf and not landed
-            # Within that time nobody comes down and is disarmed unheard.
+            # No vehicle lands and is disarmed unnoticed within this time.
             lately = now_s - self._in_air_at_s < _CONNECTED_WITHIN_S
             self._change(fell=self._disarmed_aloft and lately)
         self._change(
@@ -275,9 +272,9 @@ class Px4Telemetry:
     def _on_gps_raw_int(self, fields: Fields, now_s: float) -> None:
         hundredths, satellites = fields["eph"], fields["satellites_visible"]
         accuracy_mm, has_fix = fields["h_acc"], fields["fix_type"] >= _FIX_3D
-        before = self._heard.gps or Gps(fix=0, satellites=0, hdop=math.inf)
-        heard_at_s = now_s - self._clock.delay_s
-        # PX4 goes on telling of a receiver from which nothing comes any more.
+        before = self._newest.gps or Gps(fix=0, satellites=0, hdop=math.inf)
+        received_at_s = now_s - self._clock.delay_s
+        # PX4 continues to send the last measurement of a silent receiver.
         is_new = fields["time_usec"] != self._gps_time_us
         self._gps_time_us = fields["time_usec"]
         last, fix = self._fix, self._measured(fields) if has_fix else None
@@ -293,7 +290,7 @@ class Px4Telemetry:
                 offset_m=None if fix is None else self._offset_m(fix.place),
                 velocity_offset_m_s=None if fix is None else self._velocity_offset_m_s(fix),
                 slip_m=None if self._fix is None else self._fix.length_of_slip_m,
-                at_s=heard_at_s if is_new else before.at_s,
+                at_s=received_at_s if is_new else before.at_s,
                 repeats=0 if moved else before.repeats + is_new,
             )
         )
@@ -303,26 +300,26 @@ class Px4Telemetry:
         speed, course = fields["vel"], fields["cog"]
         velocity_m_s = None
         if _UNKNOWN_UINT16 not in (speed, course):
-            speed_m_s, estimated_m_s = speed / 100.0, self._heard.velocity_local_m_s
+            speed_m_s, estimated_m_s = speed / 100.0, self._newest.velocity_local_m_s
             if estimated_m_s is not None:
-                # Some of PX4's drivers, such as DroneCAN's, tell the speed with the climb in it.
+                # The speed of some of PX4's drivers, such as DroneCAN's, includes the climb rate.
                 level_m_s = math.sqrt(max(speed_m_s**2 - estimated_m_s[2] ** 2, 0.0))
-                seen_m_s = math.hypot(*estimated_m_s[:2])
-                speed_m_s = min(speed_m_s, level_m_s, key=lambda each: abs(each - seen_m_s))
+                expected_m_s = math.hypot(*estimated_m_s[:2])
+                speed_m_s = min(speed_m_s, level_m_s, key=lambda each: abs(each - expected_m_s))
             course_rad = math.radians(course / 100.0)
             velocity_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
         return _Fix(fields["time_usec"] / 1e6, place, velocity_m_s)
 
     def _offset_m(self, place: GlobalOrigin) -> float | None:
-        """How far in the plane a place is from the newest position."""
-        origin, position_m = self._heard.origin, self._heard.position_local_m
+        """Horizontal distance of a place from the newest position."""
+        origin, position_m = self._newest.origin, self._newest.position_local_m
         if origin is None or position_m is None:
             return None
         north_m, east_m, _ = _shift_m(origin, place)
         return math.hypot(north_m - position_m[0], east_m - position_m[1])
 
     def _velocity_offset_m_s(self, fix: "_Fix") -> float | None:
-        velocity_m_s = self._heard.velocity_local_m_s
+        velocity_m_s = self._newest.velocity_local_m_s
         if fix.velocity_m_s is None or velocity_m_s is None:
             return None
         return math.dist(fix.velocity_m_s, velocity_m_s[:2])
@@ -342,7 +339,7 @@ class Px4Telemetry:
 
     def _on_param_value(self, fields: Fields, _: float) -> None:
         if fields["param_id"] == GPS_CONTROL:
-            # An integer's bits, as a float's.
+            # An integer parameter is received as a float with the same bits.
             self.gps_control = fields["param_value"] or self.gps_control
             self._change(ignores_gps=fields["param_value"] == 0.0)
 
@@ -353,13 +350,13 @@ class Px4Telemetry:
         self._change(**changes)
 
     def _on_mission_current(self, fields: Fields, now_s: float) -> None:
-        # PX4 v1.14 tells none, which looks like 0.
+        # PX4 v1.14 has no fence id.
         self._fence = fields.get("fence_id", 0), now_s
 
     def _on_extended_sys_state(self, fields: Fields, now_s: float) -> None:
         state = fields["landed_state"]
         in_air = state > _ON_GROUND if state else None
-        if in_air and self._heard.armed:
+        if in_air and self._newest.armed:
             self._in_air_at_s, self._landed_at_s = now_s, -math.inf
         elif in_air is False and self._landed_at_s == -math.inf:
             self._landed_at_s, self._landed_at_boot_s = now_s, self._boot_s
@@ -374,7 +371,7 @@ class Px4Telemetry:
             fields["latitude"] / 1e7, fields["longitude"] / 1e7, fields["altitude"] / 1e3
         )
         self._origin_at_s = now_s
-        if self._heard.position_local_m is None:
+        if self._newest.position_local_m is None:
             self._change(origin=self._origin)
 
     def _on_local_position_ned(self, fields: Fields, now_s: float) -> None:
@@ -382,36 +379,36 @@ class Px4Telemetry:
         velocity_m_s = _vector(fields, "vx", "vy", "vz")
         boot_s = fields["time_boot_ms"] / 1e3
         restarts, self._boot_s = self._clock.restarts, boot_s
-        at_s = now_s - self._clock.hear(boot_s, now_s)
-        if self._clock.restarts > restarts and not self._heard.armed:
+        at_s = now_s - self._clock.receive(boot_s, now_s)
+        if self._clock.restarts > restarts and not self._newest.armed:
             self._change(fell=self._disarmed_aloft)
-        was_held_back = self._jump_at_s is not None
-        heard = self._heard
-        between_s = max(at_s - heard.position_at_s, 0.0)
+        was_withheld = self._jump_at_s is not None
+        last = self._newest
+        between_s = max(at_s - last.position_at_s, 0.0)
         off_m = self._off_m(position_m, velocity_m_s, between_s)
-        if self._is_held_back(off_m, between_s, now_s):
+        if self._withholds(off_m, between_s, now_s):
             return
-        changed = (position_m, velocity_m_s) != (heard.position_local_m, heard.velocity_local_m_s)
-        # That it jumped was seen at once: the time that it was held back makes it no motion.
-        unexplained = was_held_back and self._origin == heard.origin
+        changed = (position_m, velocity_m_s) != (last.position_local_m, last.velocity_local_m_s)
+        # The jump was seen without delay, so the time of withholding does not excuse it.
+        unexplained = was_withheld and self._origin == last.origin
         uncertain_s = 0.0 if unexplained else between_s
         jumped = _is_jump(off_m, uncertain_s)
-        height_jumped_m = heard.height_jumped_m
-        if jumped and heard.armed and between_s <= _HEIGHT_JUMP_WITHIN_S:
+        height_jumped_m = last.height_jumped_m
+        if jumped and last.armed and between_s <= _HEIGHT_JUMP_WITHIN_S:
             height_jumped_m -= off_m[2]
         self._change(
             position_local_m=position_m,
             velocity_local_m_s=velocity_m_s,
             position_at_s=at_s,
-            position_changed_at_s=at_s if changed else heard.position_changed_at_s,
-            jumped_at_s=at_s if jumped else heard.jumped_at_s,
+            position_changed_at_s=at_s if changed else last.position_changed_at_s,
+            jumped_at_s=at_s if jumped else last.jumped_at_s,
             height_jumped_m=height_jumped_m,
             origin=self._origin,
         )
 
-    def _is_held_back(self, off_m: Vector, between_s: float, now_s: float) -> bool:
-        """Whether the position may belong to another origin than the one that is known."""
-        if self._origin != self._heard.origin:
+    def _withholds(self, off_m: Vector, between_s: float, now_s: float) -> bool:
+        """Whether to withhold a position that may belong to an origin not received yet."""
+        if self._origin != self._newest.origin:
             self._jump_at_s = None
         elif self._jump_at_s is not None:
             answered = self._origin_at_s > self._jump_at_s
@@ -422,9 +419,9 @@ class Px4Telemetry:
         return self._jump_at_s is not None
 
     def _off_m(self, position_m: Vector, velocity_m_s: Vector, between_s: float) -> Vector:
-        """Offset of a position from where motion led since the last one, whatever their origins."""
-        last_m, last_m_s = self._heard.position_local_m, self._heard.velocity_local_m_s
-        origin, last_origin = self._origin, self._heard.origin
+        """Offset of a position from the extrapolated last one, corrected for a changed origin."""
+        last_m, last_m_s = self._newest.position_local_m, self._newest.velocity_local_m_s
+        origin, last_origin = self._origin, self._newest.origin
         if last_m is None or last_m_s is None:
             return 0.0, 0.0, 0.0
         shift = (0.0, 0.0, 0.0)
@@ -453,9 +450,10 @@ class Px4Telemetry:
 
 
 class _Fix(NamedTuple):
-    """One measurement of a receiver: its time, place, and north and east velocity.
+    """One measurement of a receiver: time, place, and north and east velocity.
 
-    `slip_m` is how far its place has moved lately in another way than its velocity says.
+    `slip_m` is the recent difference, north and east, between the movement of its place and its
+    velocity.
     """
 
     time_s: float
@@ -468,7 +466,7 @@ class _Fix(NamedTuple):
         return None if self.velocity_m_s is None else math.hypot(*self.slip_m)
 
     def after(self, last: "_Fix") -> "_Fix":
-        """The same, with the slip since an earlier one added."""
+        """This measurement with the slip since an earlier one added."""
         between_s = self.time_s - last.time_s
         if self.velocity_m_s is None or last.velocity_m_s is None:
             return self
@@ -478,7 +476,7 @@ class _Fix(NamedTuple):
         (was_north, was_east), (is_north, is_east) = last.velocity_m_s, self.velocity_m_s
         north_m -= (was_north + is_north) / 2.0 * between_s
         east_m -= (was_east + is_east) / 2.0 * between_s
-        # A jump is noticed by itself, as of the estimate.
+        # Jumps are detected separately.
         if math.hypot(north_m, east_m) >= _SLIP_JUMP_M:
             north_m = east_m = 0.0
         kept, (last_north_m, last_east_m) = math.exp(-between_s / _SLIP_S), last.slip_m
@@ -487,10 +485,10 @@ class _Fix(NamedTuple):
 
 
 class _VehicleClock:
-    """How long messages were held up, from the vehicle's own clock.
+    """Estimates the delay of messages from the vehicle's clock.
 
-    While a backlog drains, the vehicle's time passes faster than ours. Once messages come at the
-    vehicle's pace again, there is none: what then still differs is the clocks.
+    While a backlog drains, the vehicle's time passes faster than ours. Once messages arrive at the
+    vehicle's pace again, the delay is 0, and any remaining difference is clock drift.
     """
 
     _RESTART_S = 1.0
@@ -502,8 +500,8 @@ class _VehicleClock:
         self._last: tuple[float, float] | None = None
         self._at_pace = 0
 
-    def hear(self, vehicle_s: float, now_s: float) -> float:
-        """The delay of a message that the vehicle sent at its own time, s."""
+    def receive(self, vehicle_s: float, now_s: float) -> float:
+        """Add a message sent at `vehicle_s` by the vehicle's clock; returns its delay, s."""
         last_vehicle_s, last_now_s = self._last or (vehicle_s, now_s)
         self._last = vehicle_s, now_s
         sent_between_s, between_s = vehicle_s - last_vehicle_s, now_s - last_now_s
@@ -521,7 +519,7 @@ class _VehicleClock:
 
 
 def _vector(fields: Fields, x: str, y: str, z: str) -> Vector:
-    """Raises TypeError if one is not finite: then it has no value in the message."""
+    """Raises TypeError for a number that is not finite, which the message has as None."""
     return float(fields[x]), float(fields[y]), float(fields[z])
 
 
@@ -530,7 +528,7 @@ def _is_jump(off_m: Vector, between_s: float) -> bool:
 
 
 def _shift_m(start: GlobalOrigin, end: GlobalOrigin) -> Vector:
-    """North, east and down, m, from one place to another that is near."""
+    """North, east and down, m, from one place to a near one."""
     east_deg = math.remainder(end.longitude_deg - start.longitude_deg, 360.0)
     return (
         (end.latitude_deg - start.latitude_deg) * _M_PER_DEG,

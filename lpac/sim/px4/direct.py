@@ -57,9 +57,9 @@ class DirectVehicle:
         now_s = self._clock.monotonic_s()
         for name, fields in self._said(now_s):
             if name == "COMMAND_ACK":
-                self._dialogue.hear_ack(fields["command"], fields["result"], now_s)
+                self._dialogue.receive_ack(fields["command"], fields["result"], now_s)
             elif name in self._telemetry.messages:
-                self._telemetry.hear(name, fields, now_s)
+                self._telemetry.receive(name, fields, now_s)
         if now_s >= self._dialogue.next_s or self._telemetry.needs_origin():
             self._say(now_s)
 
@@ -71,7 +71,7 @@ class DirectVehicle:
         if self._told is None or self._told[:2] != (now_s, result):
             state = self._telemetry.state(
                 now_s, system_id=self._system_id, result=result,
-                link_lost=self._frames.lost(now_s), link_twice=self._frames.arrives_twice(now_s),
+                link_lost=self._frames.lost(now_s), link_twice=self._frames.has_duplicates(now_s),
             )  # fmt: skip
             self._told = now_s, result, state
         return self._told[2]
@@ -116,7 +116,7 @@ class DirectVehicle:
     # What it sends
 
     def _say(self, now_s: float) -> None:
-        for name, fields in self._dialogue.say(now_s, self.state()):
+        for name, fields in self._dialogue.due_messages(now_s, self.state()):
             if name == "REQUEST_EVENT":
                 self._send(request_event(**fields))
             elif name == "PARAM_SET":
@@ -142,7 +142,7 @@ class DirectVehicle:
             number, message_id = message.link_number, message.get_msgId()
             time_name, unit_s = _TIMES.get(message_id, ("", 0.0))
             vehicle_s = getattr(message, time_name) * unit_s if time_name else None
-            if self._frames.take(Frame(0, number % 256, number, message_id, vehicle_s), now_s):
+            if self._frames.accept(Frame(0, number % 256, number, message_id, vehicle_s), now_s):
                 yield message.get_type(), vars(_rounded(message))
 
 

@@ -84,11 +84,11 @@ while time.monotonic() - began_s < longest_s:
 """
 
 
-_LEFT_ALONE = """
+_UNATTENDED = """
 import sys
-from edge.drivers.px4 import left_alone
+from edge.drivers.px4 import unattended
 print("listens", flush=True)
-left_alone.main()
+unattended.main()
 """
 _VEHICLE = """
 import socket, sys, time
@@ -294,7 +294,7 @@ def test_no_stranger_speaks_for_a_vehicle_that_was_left_alone(
     toml = tmp_path / "robot.toml"
     url = "udpin://127.0.0.1:14551"
     toml.write_text(f'[autopilot]\nurl = "{url}"\nsystem_id = 7\n[flight]\nhover_land_s = 0.0\n')
-    with air.start(ROBOT, _LEFT_ALONE, str(toml)) as alone:
+    with air.start(ROBOT, _UNATTENDED, str(toml)) as alone:
         alone.says("listens")
         with air.start(STRANGER, _VEHICLE, ROBOT) as stranger:
             for _ in range(5):

@@ -472,7 +472,7 @@ def test_a_start_that_waited_too_long_is_not_sent(monkeypatch: pytest.MonkeyPatc
         wait(autopilot, lambda s: s.result and s.result.action is Action.ARM)
     assert [line["refusal"] for line in lines if line["event"] == "command"] == [
         "no answer",
-        "asked for too long ago",
+        "requested too long ago",
     ]
     assert not any(truth.armed for truth in vehicle.truth)
 

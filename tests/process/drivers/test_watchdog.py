@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
-from edge.drivers.px4 import left_alone
+from edge.drivers.px4 import unattended
 from edge.drivers.px4.raw_mavlink import Heartbeat, heartbeat, hold_command, land_command
 from edge.drivers.px4.watchdog import WatchdogError, WatchdogProcess
 from lpac.sim.ports import free_ports
@@ -273,14 +273,14 @@ def test_only_a_vehicle_that_hovers_and_that_nobody_took_is_landed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     own, autopilot = sockets
-    monkeypatch.setattr(left_alone, "_FRESH_S", 0.3)
-    monkeypatch.setattr(left_alone, "_GAP_S", 0.3)
+    monkeypatch.setattr(unattended, "_FRESH_S", 0.3)
+    monkeypatch.setattr(unattended, "_GAP_S", 0.3)
     address = own.getsockname()
     for custom_mode in told:
         # Of another vehicle on the same link nothing counts.
         autopilot.sendto(beat(8, POSITION), address)
         autopilot.sendto(beat(7, custom_mode), address)
-    left_alone.land_if_left(own, 7, 0.0)
+    unattended.land_unattended(own, 7, 0.0)
     autopilot.settimeout(0.01)
     try:
         message = mavlink.MAVLink(None).parse_char(autopilot.recv(300))
@@ -296,7 +296,7 @@ def test_a_program_that_hangs_and_takes_all_that_the_vehicle_says_is_killed(
     sockets: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own, _ = sockets
-    monkeypatch.setattr(left_alone, "_DEAF_S", 0.3)
+    monkeypatch.setattr(unattended, "_STARVED_S", 0.3)
     reader, writer = os.pipe()
     with (
         os.fdopen(reader),
@@ -304,5 +304,5 @@ def test_a_program_that_hangs_and_takes_all_that_the_vehicle_says_is_killed(
     ):
         os.close(writer)
         # Its end shows at the pipe, which it alone has, before the vehicle is given up.
-        assert not left_alone.land_if_left(own, 7, 0.0, reader, program.pid)
+        assert not unattended.land_unattended(own, 7, 0.0, reader, program.pid)
         assert program.wait() == -signal.SIGKILL

@@ -146,7 +146,7 @@ class ListeningAutopilot(DirectAutopilot):
         for datagram in self._link.due():
             for message in self._parser.parse_buffer(datagram) or ():
                 if message.get_type() in self._telemetry.messages:
-                    self._telemetry.hear(message.get_type(), message.to_dict(), now_s)
+                    self._telemetry.receive(message.get_type(), message.to_dict(), now_s)
         return structs.replace(self._telemetry.state(now_s), system_id=7, result=self.result)
 
 

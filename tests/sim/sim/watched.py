@@ -51,7 +51,7 @@ class Watched:
             for datagram in self._link.due():
                 for message in self._parser.parse_buffer(datagram) or ():
                     if message.get_type() in telemetry.messages:
-                        telemetry.hear(message.get_type(), message.to_dict(), vehicle.time_s)
+                        telemetry.receive(message.get_type(), message.to_dict(), vehicle.time_s)
         now_s = vehicle.time_s
         heard = telemetry.state(now_s)
         self.judgement = judge(self.judgement, heard, PositionLimits(), now_s)

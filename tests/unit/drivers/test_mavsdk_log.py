@@ -4,16 +4,16 @@ import mavsdk.plugins.param.param
 import pytest
 from mavsdk.logging import LogLevel
 
-from edge.drivers.px4.autopilot import _log_mavsdk, _take_over_log
+from edge.drivers.px4.autopilot import _on_mavsdk_log, _redirect_log
 from tests.said import lines_said
 
 
 def test_warnings_and_prints_are_lines_of_the_log(capfd: pytest.CaptureFixture[str]) -> None:
-    _take_over_log()
+    _redirect_log()
     with lines_said() as lines:
-        assert _log_mavsdk(LogLevel.DEBUG, "sent a message", None, 0)
+        assert _on_mavsdk_log(LogLevel.DEBUG, "sent a message", None, 0)
         for number in range(100):
-            assert _log_mavsdk(LogLevel.WARN, f"timeout of {number}", None, 0)
+            assert _on_mavsdk_log(LogLevel.WARN, f"timeout of {number}", None, 0)
         vars(mavsdk.plugins.param.param)["print"]("Error in callback:", ValueError("odd"))
     assert [line["times"] for line in lines] == [1, 2, 4, 8, 16, 32, 64, 1]
     assert {line["event"] for line in lines} == {"MAVSDK"}

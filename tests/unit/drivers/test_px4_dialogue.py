@@ -25,12 +25,12 @@ Answer = Callable[[Message], int | None]
 def position(telemetry: Px4Telemetry, north_m: float, now_s: float) -> None:
     fields = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
     fields |= {"x": north_m, "time_boot_ms": now_s * 1e3}
-    telemetry.hear("LOCAL_POSITION_NED", fields, now_s)
+    telemetry.receive("LOCAL_POSITION_NED", fields, now_s)
 
 
 def origin(telemetry: Px4Telemetry, now_s: float) -> None:
     fields = {"latitude": 400_000_000, "longitude": 100_000_000, "altitude": 1000}
-    telemetry.hear("GPS_GLOBAL_ORIGIN", fields, now_s)
+    telemetry.receive("GPS_GLOBAL_ORIGIN", fields, now_s)
 
 
 class Conversation:
@@ -51,7 +51,7 @@ class Conversation:
         while self.now_s < until_s:
             each(self.now_s)
             heard: list[tuple[int, int]] = []
-            for message in self.dialogue.say(self.now_s, self.vehicle):
+            for message in self.dialogue.due_messages(self.now_s, self.vehicle):
                 name, fields = message
                 if name == "COMMAND_LONG":
                     self.said.append((self.now_s, fields["command"], fields["param1"]))
@@ -59,7 +59,7 @@ class Conversation:
                     heard += [] if result is None else [(fields["command"], result)]
             self.now_s += TICK_S
             for number, result in heard:
-                self.dialogue.hear_ack(number, result, self.now_s)
+                self.dialogue.receive_ack(number, result, self.now_s)
 
     def most_within(self, seconds: float) -> int:
         at_s = [time_s for time_s, _, _ in self.said]
@@ -74,7 +74,7 @@ def test_whether_to_use_the_gps_is_asked_five_times_a_second_and_set_back_to_wha
         until_s = talk.now_s + for_s
         while talk.now_s < until_s:
             talk.dialogue.command(action, talk.now_s)
-            for name, fields in talk.dialogue.say(talk.now_s, talk.vehicle):
+            for name, fields in talk.dialogue.due_messages(talk.now_s, talk.vehicle):
                 if name == "PARAM_SET":
                     assert (fields["param_id"], fields["param_type"]) == ("EKF2_GPS_CTRL", 6)
                     said.append((talk.now_s, fields["param_value"]))
@@ -86,7 +86,7 @@ def test_whether_to_use_the_gps_is_asked_five_times_a_second_and_set_back_to_wha
 
     def px4_says(number: int) -> None:
         fields = {"param_id": "EKF2_GPS_CTRL", "param_value": of_bits(number)}
-        talk.telemetry.hear("PARAM_VALUE", fields, talk.now_s)
+        talk.telemetry.receive("PARAM_VALUE", fields, talk.now_s)
 
     px4_says(5)
     assert talk.telemetry.state(talk.now_s).ignores_gps is False
@@ -192,7 +192,7 @@ def test_a_refused_command_says_why() -> None:
     talk.dialogue.command(Action.ARM, talk.now_s)
     text = {"severity": 2, "text": "Preflight Fail: Compass 0 missing", "id": 0, "chunk_seq": 0}
     talk.go_on(0.1)
-    talk.telemetry.hear("STATUSTEXT", text, talk.now_s)
+    talk.telemetry.receive("STATUSTEXT", text, talk.now_s)
     talk.go_on(1.0)
     assert talk.dialogue.result is not None
     assert talk.dialogue.result.text == "denied: Compass 0 missing"

@@ -59,7 +59,7 @@ def state_at(name: str, at_s: float) -> VehicleState:
     telemetry = Px4Telemetry()
     for message in heard(name):
         if message.at_s <= at_s:
-            telemetry.hear(message.name, message.fields, BEGIN_S + message.at_s)
+            telemetry.receive(message.name, message.fields, BEGIN_S + message.at_s)
     return telemetry.state(BEGIN_S + at_s)
 
 
@@ -89,7 +89,7 @@ def test_reasons_for_not_arming_are_told_until_they_are_gone() -> None:
 def test_why_a_command_was_refused() -> None:
     telemetry = Px4Telemetry()
     for message in heard("refused"):
-        telemetry.hear(message.name, message.fields, BEGIN_S + message.at_s)
+        telemetry.receive(message.name, message.fields, BEGIN_S + message.at_s)
     # ARM was refused at 58.56 s, without a ground station's heartbeat.
     reasons = telemetry.refusal_reasons(BEGIN_S + 58.5)
     assert "its checks fail" in [reason.text for reason in reasons]
@@ -119,8 +119,8 @@ def test_every_reason_of_the_recordings_has_words(name: str) -> None:
     events = Px4Events()
     for message in heard(name):
         if message.name == "EVENT":
-            events.hear(message.fields, message.at_s)
-            told = events.told(0.0), events.wrong(None), events.why_not_armed(None)
+            events.receive(message.fields, message.at_s)
+            told = events.warnings(0.0), events.present_faults(None), events.arming_problems(None)
             assert not [reason for reasons in told for reason in reasons if "0x" in reason.code]
     assert events.missing() is None
 
@@ -160,11 +160,11 @@ UNKNOWN = (0x01ABCDEF, ALL_MODES, b"")
 
 def told(events: Px4Events, messages: Iterable[Heard], now_s: float = 0.0) -> None:
     for message in messages:
-        events.hear(message.fields, now_s)
+        events.receive(message.fields, now_s)
 
 
 def why(events: Px4Events, mode: Mode | None = Mode.HOLD) -> list[str]:
-    return [reason.text for reason in events.why_not_armed(mode)]
+    return [reason.text for reason in events.arming_problems(mode)]
 
 
 def test_a_report_counts_as_a_whole_and_replaces_the_one_before() -> None:
@@ -191,14 +191,14 @@ def test_a_reason_without_words_is_said_by_its_number() -> None:
     events = Px4Events()
     told(events, report(0, UNKNOWN))
     told(events, [event(3, 0x01FEDCBA, ERROR), event(4, 0x01000001, INFO)])
-    assert why(events) == ["a reason that this program has no words for: event 0x01abcdef"]
-    assert [reason.code for reason in events.told(0.0)] == ["0x01fedcba"]
+    assert why(events) == ["event 0x01abcdef, which this program does not know"]
+    assert [reason.code for reason in events.warnings(0.0)] == ["0x01fedcba"]
 
 
 def test_a_parameter_that_px4_lowers_in_flight_is_told_by_its_name() -> None:
     events = Px4Events()
     told(events, [event(0, 0x01D7F608, 4, struct.pack("<f", 3.0))])
-    (reason,) = events.told(0.0)
+    (reason,) = events.warnings(0.0)
     text = "PX4 set MPC_VEL_MANUAL to 3.0 m/s, which is MPC_XY_VEL_MAX"
     assert reason == ("mc_pos_ctrl_man_vel_set", (3.0,), text)
 
@@ -218,18 +218,18 @@ def test_lost_events_are_asked_for_and_come_in_order(lost: list[bool], first: in
     by_number = {message.fields["sequence"]: message for message in sent}
     whole, events = Px4Events(), Px4Events()
     told(whole, sent)
-    events.hear(sent[0].fields, 0.0)
+    events.receive(sent[0].fields, 0.0)
     for message, is_lost in zip(sent[1:], lost, strict=False):
         if not is_lost:
-            events.hear(message.fields, 0.0)
-    events.hear_sequence({"sequence": sent[-1].fields["sequence"]}, 0.0)
+            events.receive(message.fields, 0.0)
+    events.receive_sequence({"sequence": sent[-1].fields["sequence"]}, 0.0)
     missing = events.missing()
     if missing is not None:
         count = (missing[1] - missing[0]) % (1 << 16) + 1
         told(events, [by_number[(missing[0] + i) % (1 << 16)] for i in range(count)])
     assert events.missing() is None
     assert why(events) == why(whole)
-    assert events.told(0.0) == whole.told(0.0)
+    assert events.warnings(0.0) == whole.warnings(0.0)
 
 
 def test_events_that_never_come_are_given_up() -> None:
@@ -250,7 +250,7 @@ def test_a_repeat_is_no_news_when_others_were_given_up() -> None:
     told(events, report(0, BAROMETER))
     told(events, report(30, COMPASS), now_s=1.0)
     told(events, [event(1, "sensor_failover_baro", 0), event(2, "sensor_failover_baro", 0)], 3.5)
-    assert events.told(0.0) == ()
+    assert events.warnings(0.0) == ()
     told(events, report(33, COMPASS), now_s=3.6)
     told(events, report(36, COMPASS), now_s=3.7)
     assert why(events) == ["no data from compass 2"]
@@ -261,7 +261,7 @@ def test_a_vehicle_that_was_switched_on_anew_is_heard_again() -> None:
     told(events, report(40, BAROMETER))
     told(events, report(5, COMPASS))
     assert why(events) == ["no data from barometer 1"]
-    events.hear_sequence({"sequence": 7}, 0.0)
+    events.receive_sequence({"sequence": 7}, 0.0)
     told(events, report(8, COMPASS))
     assert why(events) == ["no data from compass 2"]
 
@@ -297,8 +297,12 @@ def test_whatever_comes_is_survived(
         fields = {
             "sequence": sequence, "id": number, "log_levels": level, "arguments": list(arguments),
         }  # fmt: skip
-        events.hear(fields, 0.0)
-        events.hear_sequence({"sequence": sequence ^ 1}, 0.0)
+        events.receive(fields, 0.0)
+        events.receive_sequence({"sequence": sequence ^ 1}, 0.0)
         events.missing()
-        for reason in (*events.why_not_armed(mode), *events.wrong(mode), *events.told(0.0)):
+        for reason in (
+            *events.arming_problems(mode),
+            *events.present_faults(mode),
+            *events.warnings(0.0),
+        ):
             assert reason.text

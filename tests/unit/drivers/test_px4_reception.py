@@ -47,7 +47,7 @@ def stream(
 
 def heard(frames: VehicleFrames, arrivals: Iterable[Arrival]) -> list[Arrival]:
     """Those that are taken."""
-    return [a for a in sorted(arrivals, key=lambda a: a[:2]) if frames.take(a.frame, a.at_s)]
+    return [a for a in sorted(arrivals, key=lambda a: a[:2]) if frames.accept(a.frame, a.at_s)]
 
 
 def later(arrivals: Iterable[Arrival], by_s: float, path: str | None = None) -> Iterator[Arrival]:
@@ -64,7 +64,7 @@ def test_a_good_link() -> None:
     frames, said = VehicleFrames(), list(stream("a", 0.0, 30.0))
     assert heard(frames, said) == said
     assert frames.lost(30.0) == 0.0
-    assert not frames.arrives_twice(30.0) and not frames.has_others(30.0)
+    assert not frames.has_duplicates(30.0) and not frames.has_twin(30.0)
 
 
 def merged(first: int) -> list[Arrival]:
@@ -80,7 +80,7 @@ def test_merged_channels_of_one_vehicle_are_all_taken(first: int) -> None:
     frames, said = VehicleFrames(), merged(first)
     assert len(heard(frames, said)) == len(said)
     assert all(frames.lost(float(now_s)) == 0.0 for now_s in range(60))
-    assert not frames.arrives_twice(60.0) and not frames.has_others(60.0)
+    assert not frames.has_duplicates(60.0) and not frames.has_twin(60.0)
 
 
 @pytest.mark.parametrize("first", [70, 100, 180])
@@ -90,7 +90,7 @@ def test_what_merged_channels_lose_is_counted(first: int) -> None:
     arrived = [a for a in merged(first) if draw.random() >= 0.2]
     assert len(heard(frames, arrived)) > 0.9 * len(arrived)
     assert frames.lost(60.0) == pytest.approx(0.2, abs=0.051)
-    assert not frames.arrives_twice(60.0) and not frames.has_others(60.0)
+    assert not frames.has_duplicates(60.0) and not frames.has_twin(60.0)
 
 
 @pytest.mark.parametrize("by_s", [0.0, 0.08, 1.0])
@@ -98,7 +98,7 @@ def test_merged_channels_that_come_twice_are_taken_once(by_s: float) -> None:
     frames, said = VehicleFrames(), merged(100)
     taken = heard(frames, [*said, *later(said, by_s)])
     assert len(taken) == len({(a.order, a.frame.content) for a in taken})
-    assert frames.arrives_twice(60.0) and not frames.has_others(60.0)
+    assert frames.has_duplicates(60.0) and not frames.has_twin(60.0)
 
 
 def test_a_copy_older_than_what_is_remembered_is_not_taken_for_another_channel() -> None:
@@ -112,8 +112,8 @@ def test_what_is_remembered_is_bounded() -> None:
     for n in range(200 * 256):
         # The numbers come round each second: the heartbeat is the same, byte for byte.
         content = "heartbeat" if n % 256 == 0 else n
-        assert frames.take(Frame("a", n % 256, content, HEARTBEAT), n / 256.0)
-        most = max(most, len(frames._taken))
+        assert frames.accept(Frame("a", n % 256, content, HEARTBEAT), n / 256.0)
+        most = max(most, len(frames._accepted))
     assert most <= 4 * 256
 
 
@@ -126,7 +126,7 @@ def test_what_is_lost_is_counted(share: float) -> None:
     # A message that says what one said before, with the same number, may pass for that.
     assert len(taken) > 0.97 * len(arrived)
     assert frames.lost(60.0) == pytest.approx(share, abs=0.051)
-    assert not frames.arrives_twice(60.0) and not frames.has_others(60.0)
+    assert not frames.has_duplicates(60.0) and not frames.has_twin(60.0)
 
 
 @pytest.mark.parametrize("by_s", [0.0, 0.005, 0.08, 0.5, 2.0])
@@ -139,8 +139,8 @@ def test_what_comes_twice_is_taken_once(by_s: float, path: str | None, loss: flo
     taken = heard(frames, [*first, *later(said, by_s, path)])
     again = len(taken) - len({a.order for a in taken})
     assert again <= (0.01 * len(taken) if path is None and loss else 0)
-    assert frames.arrives_twice(30.0)
-    assert not frames.has_others(30.0)
+    assert frames.has_duplicates(30.0)
+    assert not frames.has_twin(30.0)
     positions = [a for a in taken if a.frame.message_id == POSITION]
     assert len(positions) >= 0.9 * (1.0 - loss) * 20.0 * 30.0
     assert is_in_order(positions)
@@ -174,7 +174,7 @@ def test_what_was_overtaken_is_lost() -> None:
     assert is_in_order([a for a in taken if a.frame.message_id == POSITION])
     assert is_in_order([a for a in taken if a.frame.message_id != POSITION])
     assert len(taken) > 0.85 * len(said)
-    assert not frames.has_others(30.0) and not frames.arrives_twice(30.0)
+    assert not frames.has_twin(30.0) and not frames.has_duplicates(30.0)
 
 
 @pytest.mark.parametrize("silent_s", [1.5, 4.0, 20.0])
@@ -186,7 +186,7 @@ def test_a_vehicle_that_is_switched_on_anew_is_heard(silent_s: float, first: int
     said = list(stream("a", again_s, again_s + 20.0, boot_s=again_s - 1.0, name="b", first=first))
     taken = heard(frames, said)
     assert len(taken) > 0.97 * len(said)
-    assert not frames.has_others(again_s + 20.0)
+    assert not frames.has_twin(again_s + 20.0)
 
 
 def test_another_vehicle_in_its_place_is_heard_after_a_while() -> None:
@@ -206,7 +206,7 @@ def test_two_vehicles_with_one_system_id(boot_s: float, path: str, first: int) -
     frames = VehicleFrames()
     other = stream(path, 50.0, 80.0, boot_s=boot_s, name="b", first=first)
     heard(frames, [*stream("a", 50.0, 80.0), *other])
-    assert frames.has_others(80.0)
+    assert frames.has_twin(80.0)
 
 
 @given(
@@ -225,7 +225,7 @@ def test_nothing_that_comes_breaks_it(
     for path, number, content, kind, vehicle_s, after_s in frames_said:
         now_s += after_s
         told = vehicle_s if kind == POSITION else None
-        frames.take(Frame(path, number, content, kind, told), now_s)
+        frames.accept(Frame(path, number, content, kind, told), now_s)
         assert 0.0 <= frames.lost(now_s) <= 1.0
         assert math.isfinite(frames.lost(now_s))
-        frames.has_others(now_s), frames.arrives_twice(now_s)
+        frames.has_twin(now_s), frames.has_duplicates(now_s)

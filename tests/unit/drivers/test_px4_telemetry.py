@@ -58,7 +58,7 @@ def conclusions(
             fields = message.to_dict()
             if message.get_type() == "GPS_RAW_INT":
                 fields = receiver(heard_s, fields)
-            telemetry.hear(message.get_type(), fields, heard_s)
+            telemetry.receive(message.get_type(), fields, heard_s)
     return found
 
 
@@ -141,7 +141,7 @@ def test_a_flight_by_its_height_and_thrust(name: str) -> None:
 
 def test_a_thrust_that_is_not_told_any_more_is_not_known() -> None:
     telemetry = Px4Telemetry()
-    telemetry.hear("VFR_HUD", {"throttle": 48}, 10.0)
+    telemetry.receive("VFR_HUD", {"throttle": 48}, 10.0)
     assert telemetry.state(12.0).thrust == 0.48
     assert telemetry.state(13.0).thrust is None
 
@@ -226,7 +226,7 @@ def test_a_jump_in_height_that_an_origin_explains_late_is_none() -> None:
 
     def origin(altitude_m: float) -> None:
         fields = {"latitude": 0, "longitude": 0, "altitude": altitude_m * 1e3}
-        telemetry.hear("GPS_GLOBAL_ORIGIN", fields, now_s)
+        telemetry.receive("GPS_GLOBAL_ORIGIN", fields, now_s)
 
     for tick in range(400):
         now_s, jumped = tick * 0.05, tick >= 200
@@ -236,10 +236,10 @@ def test_a_jump_in_height_that_an_origin_explains_late_is_none() -> None:
             origin(394.0)
         if tick % 20 == 0:
             armed = 0x80 if tick >= 40 else 0
-            telemetry.hear("HEARTBEAT", {**heartbeat, "base_mode": armed}, now_s)
+            telemetry.receive("HEARTBEAT", {**heartbeat, "base_mode": armed}, now_s)
         down_m = -5.0 - 0.01 * tick - (6.0 if jumped else 0.0) - (4.0 if tick < 20 else 0.0)
         position = {"x": 0.0, "y": 0.0, "z": down_m, "vx": 0.0, "vy": 0.0, "vz": -0.2}
-        telemetry.hear("LOCAL_POSITION_NED", {**position, "time_boot_ms": now_s * 1e3}, now_s)
+        telemetry.receive("LOCAL_POSITION_NED", {**position, "time_boot_ms": now_s * 1e3}, now_s)
         told.append(telemetry.state(now_s).height_jumped_m)
     assert set(told[:200]) == {0.0}  # On the ground it may jump.
     assert told[230:300] == pytest.approx([6.0] * 70, abs=0.01)
@@ -253,7 +253,7 @@ def test_what_sys_status_told_is_not_known_once_it_falls_silent() -> None:
     for heard_s, message in (r for r in recorded("normal") if r.is_px4):
         kind = message.get_type()
         if kind in telemetry.messages and not (kind == "SYS_STATUS" and heard_s > 30.0):
-            telemetry.hear(kind, message.to_dict(), heard_s)
+            telemetry.receive(kind, message.to_dict(), heard_s)
         if 31.0 < heard_s < 35.0:
             found.append(telemetry.state(heard_s))
     told = [(s.battery, s.voltage_v, s.remote_control, s.armable) for s in found]
@@ -268,7 +268,7 @@ def test_a_vehicle_is_there_as_long_as_it_says_anything() -> None:
     for heard_s, message in (r for r in recorded("normal") if r.is_px4):
         kind = message.get_type()
         if kind in telemetry.messages and not (kind == "HEARTBEAT" and heard_s > 30.0):
-            telemetry.hear(kind, message.to_dict(), heard_s)
+            telemetry.receive(kind, message.to_dict(), heard_s)
         if 30.0 < heard_s < 44.0:
             connected = telemetry.state(heard_s).connected
             assert connected == (heard_s - telemetry.state(heard_s).heartbeat_at_s < 10.0)
@@ -283,7 +283,7 @@ def test_after_a_silence_it_is_there_once_its_mode_is_known() -> None:
     for heard_s, message in (r for r in recorded("normal") if r.is_px4):
         kind = message.get_type()
         if kind in telemetry.messages and not silent_s[0] < heard_s < silent_s[1]:
-            telemetry.hear(kind, message.to_dict(), heard_s)
+            telemetry.receive(kind, message.to_dict(), heard_s)
             state = telemetry.state(heard_s)
             connected.append((heard_s, state.connected))
             assert not state.connected or heard_s < 35.0 or state.heartbeat_at_s > 35.0
@@ -364,15 +364,17 @@ class Said:
 
     def heartbeat(self, *, armed: bool) -> None:
         fields = {"autopilot": 12, "system_status": 4, "base_mode": armed << 7, "custom_mode": 0}
-        self.telemetry.hear("HEARTBEAT", fields, self.now_s)
+        self.telemetry.receive("HEARTBEAT", fields, self.now_s)
 
     def landed_state(self, *, in_air: bool) -> None:
-        self.telemetry.hear("EXTENDED_SYS_STATE", {"landed_state": 2 if in_air else 1}, self.now_s)
+        self.telemetry.receive(
+            "EXTENDED_SYS_STATE", {"landed_state": 2 if in_air else 1}, self.now_s
+        )
 
     def position(self, boot_s: float) -> None:
         fields = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
         fields["time_boot_ms"] = round(1e3 * boot_s)
-        self.telemetry.hear("LOCAL_POSITION_NED", fields, self.now_s)
+        self.telemetry.receive("LOCAL_POSITION_NED", fields, self.now_s)
 
     def fly(self) -> None:
         self.heartbeat(armed=True)
@@ -479,7 +481,7 @@ def test_modes(px4: Px4Mode, mode: Mode) -> None:
         "custom_mode": main << 16 | sub << 24,
         "system_status": 3,
     }
-    telemetry.hear("HEARTBEAT", heartbeat, 0.0)
+    telemetry.receive("HEARTBEAT", heartbeat, 0.0)
     assert telemetry.state(0.0).mode is mode
 
 
@@ -494,7 +496,7 @@ def test_a_backlog_is_as_old_as_it_is(stop_s: float, burst_s: float, jitter_s: l
 
     def hear(vehicle_s: float, now_s: float) -> VehicleState:
         fields = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
-        telemetry.hear("LOCAL_POSITION_NED", {**fields, "time_boot_ms": vehicle_s * 1e3}, now_s)
+        telemetry.receive("LOCAL_POSITION_NED", {**fields, "time_boot_ms": vehicle_s * 1e3}, now_s)
         return telemetry.state(now_s)
 
     clocks_differ_s = 1234.5
@@ -514,7 +516,7 @@ def test_a_backlog_is_as_old_as_it_is(stop_s: float, burst_s: float, jitter_s: l
 def test_a_position_that_is_none_changes_nothing(fields: dict[str, float | None]) -> None:
     telemetry = Px4Telemetry()
     with pytest.raises((KeyError, TypeError)):
-        telemetry.hear("LOCAL_POSITION_NED", fields, 0.0)
+        telemetry.receive("LOCAL_POSITION_NED", fields, 0.0)
     assert telemetry.state(0.0) == Px4Telemetry().state(0.0)
 
 
@@ -522,7 +524,7 @@ def test_a_long_text_comes_in_pieces() -> None:
     telemetry = Px4Telemetry()
     for piece, text in enumerate(("Preflight Fail: Compass needs calibration be", "fore flight\t")):
         fields = {"severity": 2, "text": text, "id": 9, "chunk_seq": piece}
-        telemetry.hear("STATUSTEXT", fields, 1.0)
+        telemetry.receive("STATUSTEXT", fields, 1.0)
     (problem,) = telemetry.state(2.0).problems
     assert problem.text == "Compass needs calibration before flight"
     assert telemetry.state(60.0).problems == ()
