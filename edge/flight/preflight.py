@@ -51,12 +51,12 @@ class PreflightInputs:
     mission frame; the slot's height is above the takeoff point. `errors` determine the distances of
     robots. `failsafe_problems` come from `failsafe.check`, None before the vehicle's parameters
     were read. `fence_changed`: the vehicle had the right fence, and somebody else changed it.
-    `neighbours` are the robots heard recently, `strangers` those with unreadable messages,
-    `unheard` those heard by the ground only, `fell_silent` those that fell silent in flight and may
-    still be in the air, as of their last message; `separation` has the distance from them.
-    `ground_release` is the ground's release, "" if it is this robot's. `ground_age_s` is the age of
-    the ground's last message, None if there was none; the fleet's time is known to
-    `time_uncertainty_s`, None if unknown. `has_answer`: the policy has answered recently.
+    `neighbours` are the robots received recently, `unreadable_robots` those with messages of
+    another version, `missing_robots` those received by the ground only. `fell_silent` are robots
+    that fell silent in flight and may still be in the air, as of their last message; `separation`
+    has the distance from them. `ground_release` is the ground's release, "" if it is this robot's.
+    `ground_age_s` is the age of the ground's last message, None if there was none; the fleet's time
+    is known to `time_uncertainty_s`, None if unknown. `has_answer`: the policy answered recently.
     `answer_problem` is the fault of the sensor's or policy's last result, "" if unknown.
     """
 
@@ -81,9 +81,9 @@ class PreflightInputs:
     min_separation_m: float
     errors: ErrorBudget
     neighbours: Sequence[ReceivedBeacon]
-    strangers: Sequence[str]
+    unreadable_robots: Sequence[int]
     ground_release: str
-    unheard: Sequence[int]
+    missing_robots: Sequence[int]
     fell_silent: Sequence[Neighbour]
     separation: SeparationLimits
     rc: RemoteControl
@@ -333,17 +333,17 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
     if inputs.duplicate_id:
         yield FailedCheck(
             CheckCode.DUPLICATE_ID,
-            f"another program says that it is robot {inputs.robot_id}: stop it, or change its id",
+            f"another program uses the id of robot {inputs.robot_id}: stop it, or change its id",
         )
     releases = [(f"robot {beacon.robot_id}", beacon.other_release) for beacon in others]
-    unreadable = [(name, "not readable") for name in inputs.strangers]
+    unreadable = [(f"robot {each}", "not readable") for each in inputs.unreadable_robots]
     for who, release in (*releases, ("the ground", inputs.ground_release), *unreadable):
         if release:
             yield FailedCheck(
                 CheckCode.OTHER_RELEASE,
                 f"{who} flies another release ({release}) than this robot: deploy one to all",
             )
-    for robot_id in inputs.unheard:
+    for robot_id in inputs.missing_robots:
         yield FailedCheck(
             CheckCode.OTHER_NOT_HEARD,
             f"the ground hears robot {robot_id}, and this robot does not: they would not keep "

@@ -1,1 +1,1 @@
-"""One robot: its steps, its configuration, and the process around them."""
+"""One robot: its configuration, its steps, and the process that runs them."""

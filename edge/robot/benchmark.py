@@ -1,4 +1,4 @@
-"""How long a robot's steps take on this machine: its own code, with as many neighbours as asked."""
+"""Benchmark of a robot's steps on this machine: its own code, with any number of neighbours."""
 
 import math
 import platform
@@ -17,7 +17,7 @@ from edge.policy.family import Policy
 from edge.robot.config import Rates
 from edge.robot.pac import Pac, PacParameters
 
-# Of a step's period that it may take: the loops share the core with each other and with PX4.
+# Largest share of a step's period: the loops share the core with each other and with PX4.
 MOST_OF_PERIOD = 0.5
 
 _WARM_UP_TICKS = 5
@@ -27,7 +27,7 @@ _MOST_NEIGHBOURS = 1000
 
 @dataclass(frozen=True, slots=True)
 class StepTimes:
-    """Times of one step, over all its calls, and the period that it has in flight; ms."""
+    """Times of all calls of one step, and its period in flight; ms."""
 
     step: str
     calls: int
@@ -43,7 +43,7 @@ class StepTimes:
 
     @property
     def fits(self) -> bool:
-        """Whether it leaves enough of the period to the others."""
+        """Whether the step leaves enough of its period to the others."""
         return self.share <= MOST_OF_PERIOD
 
 
@@ -57,11 +57,11 @@ class Benchmark:
 
 
 def benchmark(policy: Policy, neighbours: int, seconds: float) -> Benchmark:
-    """Let a robot perceive and infer, one tick after another, for about `seconds`.
+    """Measure ticks of perception and inference for about `seconds`.
 
-    All `neighbours` are in range, and each has sent a message before each tick. What they send and
-    what the robot sees is random, of the sizes that it has in flight. Raises BundleError if no
-    robot can fly the policy, PartError if it fails, ValueError for a number that cannot be.
+    All `neighbours` are in range, and each sends a message before each tick. Messages and views are
+    random, of their size in flight. Raises BundleError if no robot can fly the policy, PartError if
+    it fails, ValueError for an impossible number.
     """
     if not 0 <= neighbours <= _MOST_NEIGHBOURS:
         raise ValueError(f"neighbours = {neighbours}: must be from 0 to {_MOST_NEIGHBOURS}")
@@ -86,7 +86,7 @@ def benchmark(policy: Policy, neighbours: int, seconds: float) -> Benchmark:
 
 
 class _Flight:
-    """One robot that circles over a random world, neighbours around it; mission and model agree."""
+    """One robot that circles in a random world among neighbours; mission units are model units."""
 
     def __init__(self, policy: Policy, neighbours: int) -> None:
         self._policy = policy
@@ -100,7 +100,7 @@ class _Flight:
             parameters=PacParameters(scale=ModelScale(1.0, 1.0), max_speed_m_s=1.0),
         )
         perception = policy.manifest.perception
-        assert perception is not None  # or Pac would have said so
+        assert perception is not None  # Pac has refused it otherwise.
         self._perception = perception
         self._view = self._rng.random((perception.sensor_size,) * 2, np.float32)
         angles_rad = self._rng.uniform(0.0, math.tau, neighbours)

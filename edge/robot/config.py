@@ -1,7 +1,7 @@
 """One robot's configuration: TOML into frozen dataclasses.
 
-Relative paths are meant from the file's own folder. Every mistake is one line that names the file,
-the key, the value and what is allowed.
+Relative paths start at the file's folder. An error is one line with the file, the key, the value
+and what is allowed.
 """
 
 import re
@@ -43,9 +43,9 @@ from edge.flight.state import FlightParameters, RemoteControlLost, Robot
 from edge.messages.bounds import RobotId
 from edge.robot.pac import PacParameters
 
-# What fleet.toml has too. Each function raises ValueError, one line that says what is allowed.
+# Also of fleet.toml. Each function raises ValueError, one line that says what is allowed.
 
-# Of a fleet, a robot, a site: a part of radio keys and of file names.
+# Name of a fleet, robot or site: a part of radio keys and file names.
 PlainName = Annotated[
     str,
     Meta(
@@ -69,10 +69,10 @@ def require_url(key: str, url: str) -> None:
 
 
 def require_group(key: str, group: str) -> tuple[str, int]:
-    """The address and the port of a multicast group."""
+    """Return the address and the port of a multicast group."""
     found = host_and_port(key, group)
     address = None if found is None else ipv4(found[0])
-    # 224.0.0.0/24 is for the network's own protocols.
+    # 224.0.0.0/24 is reserved for network protocols.
     is_group = (
         address is not None and address.is_multicast and address.packed[:3] != b"\xe0\x00\x00"
     )
@@ -86,7 +86,7 @@ def require_group(key: str, group: str) -> tuple[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
-    """Sensor of the ground: a `type` of `edge.drivers.registry`, and what that takes."""
+    """The sensor: a `type` of `edge.drivers.registry`, and its `options`."""
 
     type: str = "world"
     options: dict[str, object] = field(default_factory=dict, hash=False)
@@ -94,11 +94,11 @@ class SensorConfig:
 
 @dataclass(frozen=True, slots=True)
 class AutopilotConfig(Bounded):
-    """The vehicle: a `type` of `edge.drivers.registry`, and what that takes.
+    """The vehicle: a `type` of `edge.drivers.registry`, and its `options`.
 
-    `url` is where PX4's datagrams come in, e.g. udpin://127.0.0.1:14551; `system_id` which one it
-    is. At another address whoever is on that network can pose as the vehicle: that must be said, by
-    `insecure`.
+    `url` receives PX4's datagrams, e.g. udpin://127.0.0.1:14551; `system_id` is PX4's. Any other
+    address than 127.0.0.1 requires `insecure`, since anybody on its network can pose as the
+    vehicle.
     """
 
     url: str
@@ -112,9 +112,8 @@ class AutopilotConfig(Bounded):
             require_url("url", self.url)
             if not (self.insecure or is_loopback(self.url[len("udpin://") :].rpartition(":")[0])):
                 raise ValueError(
-                    f"url = {self.url!r}: whoever is on that network could pose as the vehicle: "
-                    "must be at 127.0.0.1; where PX4 is at the other end of a wire of its own, say "
-                    "insecure = true"
+                    f"url = {self.url!r}: anybody on that network could pose as the vehicle: must "
+                    "be at 127.0.0.1; where PX4 has a wire of its own, set insecure = true"
                 )
 
 
@@ -125,13 +124,13 @@ def port_of(url: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class LinkConfig:
-    """How robots find each other: zenoh endpoints such as tcp/192.168.8.10:7447, or scouting.
+    """The radio: zenoh endpoints to listen on and connect to, or scouting.
 
-    Members of a fleet ([identity]) meet by TLS: tls/192.168.8.10:7447. Without an identity whoever
-    reaches the radio can fly the robot: beyond this machine that must be said, by `insecure`.
-    With `group` robots tell each other what they have to say by multicast, to that IPv4 address and
-    port, in the network of their own address `interface`, and grounds connect to them.
-    `type` is one of `edge.drivers.registry`; `options` is what another type takes besides.
+    Members of a fleet ([identity]) use TLS endpoints, such as tls/192.168.8.10:7447; others use
+    tcp. Without an identity, anybody on the network can fly the robot: beyond this machine that
+    requires `insecure`. With `group`, robots send to each other by multicast to that IPv4 address
+    and port, in the network of their own address `interface`, and grounds connect to them. `type`
+    is one of `edge.drivers.registry`; `options` are another type's.
     """
 
     listen: tuple[str, ...] = ()
@@ -156,13 +155,13 @@ class LinkConfig:
         has_interface = ipv4(self.interface) is not None
         if bool(self.group) != has_interface or (self.interface and not has_interface):
             raise ValueError(
-                f"interface = {self.interface!r}: must be the robot's own IPv4 address, with group "
-                "alone"
+                f"interface = {self.interface!r}: must be the robot's own IPv4 address with group, "
+                "and empty without"
             )
 
     @property
     def leaves_machine(self) -> bool:
-        """Whether somebody on another computer may be heard."""
+        """Whether messages from other computers may arrive."""
         if self.type != "zenoh" or self.scouting or not self.listen:
             return True
         if self.group and not self.interface.startswith("127."):
@@ -179,7 +178,7 @@ class IdentityConfig:
 
 @dataclass(frozen=True, slots=True)
 class Rates(Bounded):
-    """How often the three loops run, Hz."""
+    """Rates of the three loops, Hz."""
 
     perception_hz: _LoopRate = 5.0
     policy_hz: _LoopRate = 2.5
@@ -193,8 +192,8 @@ class Rates(Bounded):
 class PolicyConfig(Bounded):
     """The bundle, the world it flies over, and the paper's scales.
 
-    `payload`: what its messages are encoded as; by default as the smallest of those that the policy
-    was judged with.
+    `payload` is the encoding of its messages, by default the smallest that the policy was judged
+    with.
     """
 
     bundle: str
@@ -206,9 +205,9 @@ class PolicyConfig(Bounded):
     payload: Literal["smallest", PayloadType] = "smallest"
 
     def payload_of(self, judged: Sequence[PayloadType]) -> PayloadType:
-        """Encoding of messages, of those that the policy was `judged` with.
+        """Encoding of messages, one of those that the policy was `judged` with.
 
-        Raises ConfigError if it was not judged with the one that is asked for.
+        Raises ConfigError if the configured one is not among them.
         """
         if self.payload == "smallest":
             return max(judged, key=PAYLOAD_TYPES.index)
@@ -222,12 +221,11 @@ class PolicyConfig(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class FailsafeConfig(Bounded):
-    """PX4's reactions when something fails: for an RC pilot, or for none.
+    """PX4's failsafes, with an RC pilot or without.
 
-    `parameters`: whether wrong PX4 parameters are set, also in flight if somebody else changes
-    them, or arming is refused.
-    `fence_margin_m`: how far outside our fence PX4's own is. `rc_lost`: what a robot does whose
-    pilot's remote control is lost in flight.
+    `parameters`: whether the program sets wrong PX4 parameters, also in flight after somebody
+    changed them, or refuses to arm. PX4's fence is `fence_margin_m` outside the robot's. `rc_lost`
+    is the reaction in flight to the loss of the pilot's remote control.
     """
 
     rc: Literal["pilot", "none"]
@@ -246,7 +244,7 @@ class LogConfig(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class RobotConfig(Bounded):
-    """All of robot.toml. `on_stop` is what a stopped program leaves a flying vehicle to do."""
+    """All of robot.toml. `on_stop` is a flying vehicle's action when the program stops."""
 
     fleet: PlainName
     robot_id: RobotId
@@ -273,8 +271,8 @@ class RobotConfig(Bounded):
             raise ValueError("link.insecure = true: not with [identity] folder")
         if self.link.leaves_machine and not (self.identity.folder or self.link.insecure):
             raise ValueError(
-                "[identity] folder is missing: whoever is on the network could fly this robot: "
-                "enroll it (`lpac fleet enroll`), or say link.insecure = true"
+                "[identity] folder is missing: anybody on the network could fly this robot: enroll "
+                "it (`lpac fleet enroll`), or set link.insecure = true"
             )
         if self.flight.command_timeout_s * self.rates.control_hz < 2.0:
             raise ValueError(
@@ -282,7 +280,7 @@ class RobotConfig(Bounded):
                 f"two periods of rates: control_hz = {self.rates.control_hz}"
             )
         self._check_schemes()
-        # What only shows when the tables come together, before any of it is used.
+        # Errors that only show when the tables are combined.
         required(self.failsafe.rc, self.fence.ceiling_m, self.flight.command_timeout_s)
         self.robot(boot_nonce=0)
         beyond = self.errors.px4_fence(self.limits)
@@ -300,7 +298,7 @@ class RobotConfig(Bounded):
                     raise ValueError(f"link: {name} = {endpoint!r}: must be {must}")
 
     def robot(self, boot_nonce: int) -> Robot:
-        """The robot that flies, in this start of its program."""
+        """The configured robot, for this start of its program."""
         return Robot(
             self.robot_id,
             boot_nonce,
@@ -314,7 +312,7 @@ class RobotConfig(Bounded):
 
     @property
     def free_ground(self) -> Margin:
-        """How far around its fence nobody may be, whatever fails."""
+        """Distance around its fence that people must keep clear of, whatever fails."""
         beyond_m, ceiling_m = self.failsafe.fence_margin_m, self.fence.ceiling_m
         return self.errors.free_ground(self.limits, beyond_m, ceiling_m)
 
@@ -331,7 +329,7 @@ class RobotConfig(Bounded):
 
 
 def load_config(path: Path) -> RobotConfig:
-    """The configuration in the file, its paths made absolute. Raises ConfigError."""
+    """The configuration in the file, with absolute paths. Raises ConfigError."""
     mapping = read_toml(path)
     folder = path.resolve().parent
     for table, key in (

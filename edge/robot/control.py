@@ -1,4 +1,4 @@
-"""One control tick of a robot: what it knows -> flight state -> setpoint and commands."""
+"""One control tick of a robot: inputs -> flight state -> setpoint and commands."""
 
 import math
 from collections.abc import Callable
@@ -44,21 +44,20 @@ from edge.robot.neighbours import BEACON_LASTS_S
 from edge.robot.pac import Pac
 from edge.robot.readiness import Assignment, Checks
 
-# Beacons come at the policy's rate, or a little less often without it.
-_KEEPS_AWAY_S = 1.5
-# Beacons that a bad radio loses make nobody look for another landing point.
+# Beacons come at the policy's rate, or slightly less often without a policy.
+_NEIGHBOUR_TIMEOUT_S = 1.5
+# Longer, so that beacons lost by a bad radio move no landing point.
 _SILENT_FOR_GOOD_S = 3.0
-# Checks that are older say nothing about now.
 _MAX_CHECKS_AGE_S = 5.0
 # Longer than any drone stays in the air.
 _REVOKED_STAYS_S = 1800.0
 _BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
-# Where others take a robot to keep its own height.
+# States in which others expect a robot at its own height.
 _AT_OWN_HEIGHT = (FlightState.HOLD, FlightState.MISSION, FlightState.RETURN)
 
 
 class GroundWorld(NamedTuple):
-    """A world that the ground sent, as a sensor over it; or why it cannot be one."""
+    """A world from the ground: a sensor over it, or the problem with it."""
 
     world_id: str
     sensor: Sensor | Camera | None
@@ -66,13 +65,12 @@ class GroundWorld(NamedTuple):
 
 
 class FlightControl:
-    """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
+    """Flies one robot. Call `tick` from the control thread; read the fields from any.
 
-    Another thread sets `checks`, `revoked` (robots that nobody listens to any more), `px4_change`,
-    and `world` for the `wanted_world_id`, whole.
-    `obeyed_sequence` and `operator` are the last ground state's. `assignment` is what is flown by,
-    `not_taken` what of the ground's state it is not. `fell_silent` is as in `FlightInputs`.
-    `energy` is how long the battery lasts, and the way home takes.
+    Other threads set these fields whole: `checks`, `revoked` (revoked robots), `px4_change`, and
+    `world` for the `wanted_world_id`. `obeyed_sequence` and `operator` are the last ground state's.
+    `assignment` is in use, `not_taken` lists the parts of the ground's state that are not.
+    `fell_silent` is as in `FlightInputs`, `energy` the battery's estimate.
     """
 
     def __init__(
@@ -100,8 +98,8 @@ class FlightControl:
         self._guidance = Guidance()
         self._last_tick_s: float | None = None
         self._has_flown = False
-        self._time_heard_at_s = -math.inf
-        self._ground_said: FleetTime | None = None
+        self._time_received_at_s = -math.inf
+        self._ground_time: FleetTime | None = None
         self._energy_parameters = energy
         self._consumption = Consumption(energy)
         self.energy: Energy | None = None
@@ -111,11 +109,11 @@ class FlightControl:
         self.px4_change: Px4Change | None = None
         self.revoked: frozenset[int] = frozenset()
         self.fell_silent: tuple[Neighbour, ...] = ()
-        # By robot id: the last that was heard of it in this frame, and when that was so.
+        # By robot id, in this frame: the last place of each, and its time.
         self._last_places: dict[int, tuple[Neighbour, float]] = {}
-        # The last beacon of who flies that tells a place, in this frame.
-        self._last_words: dict[int, ReceivedBeacon] = {}
-        # The last beacon of each, in this frame: who stands somewhere may have been switched off.
+        # The last beacon with a position of each armed robot.
+        self._last_flying: dict[int, ReceivedBeacon] = {}
+        # The last beacon of each: a robot on the ground may have been switched off.
         self._last_beacons: dict[int, Beacon] = {}
         self._lands_beside_m: Point | None = None
         self.assignment = Assignment(None, robot, world_id)
@@ -127,27 +125,27 @@ class FlightControl:
         self.operator = ""
 
     def tick(self, now_s: float) -> bool:
-        """One tick: reads the newest of everything, sends at most one setpoint.
+        """Run one tick on the newest inputs; sends at most one setpoint.
 
-        Whether the vehicle flies by it: one that PX4's own failsafe has is not to be held.
+        Returns whether the vehicle flies by it: the watchdog must not stop PX4's own failsafe.
         """
         vehicle = self._vehicle.state()
         ground, ground_age_s = self._inbox.ground(now_s)
         if ground is not None:
-            told = ground.operator, ground.sequence, ground.safety_action_by
-            if told != self._ground_recorded:
-                self._ground_recorded = told
+            version = ground.operator, ground.sequence, ground.safety_action_by
+            if version != self._ground_recorded:
+                self._ground_recorded = version
                 self._recorder.record("ground", self._unix_clock_s(), asdict(ground))
             self.obeyed_sequence, self.operator = ground.sequence, ground.operator
-            self._hear_time(ground, now_s - ground_age_s)
+            self._update_time(ground, now_s - ground_age_s)
             ground_age_s = self.ground_age_s(now_s)
-            self._take_up(ground, vehicle)
-        self._navigation.look(vehicle, now_s)
+            self._adopt(ground, vehicle)
+        self._navigation.update(vehicle, now_s)
         odometry = self._navigation.estimate(vehicle)
-        peers = self._pac.table.heard(now_s, BEACON_LASTS_S)
-        heard = self._neighbours(peers, now_s)
+        peers = self._pac.table.beacons(now_s, BEACON_LASTS_S)
+        neighbours = self._neighbours(peers, now_s)
         silence = self.assignment.robot.silence
-        silent = self._silent(peers, heard, silence, now_s)
+        silent = self._silent(peers, neighbours, silence, now_s)
         self.fell_silent = tuple(each for each in silent if highest_still_m(each, silence) > 0.0)
         inputs = FlightInputs(
             now_s=now_s,
@@ -156,9 +154,9 @@ class FlightControl:
             odometry=odometry,
             policy_velocity_m_s=self._pac.control(now_s),
             policy_problem=self._pac.problem,
-            neighbours=(*heard, *self._revoked_places(heard, now_s)),
-            # A thief's last word brakes, but keeps nobody from a mission.
-            closest=self._closest(odometry, heard),
+            neighbours=(*neighbours, *self._revoked_places(neighbours, now_s)),
+            # Without revoked robots: a thief's last position may brake, but not prevent a mission.
+            closest=self._closest(odometry, neighbours),
             busy_neighbours=tuple(
                 peer.beacon.robot_id for peer in peers if peer.beacon.state in _BUSY
             ),
@@ -171,7 +169,7 @@ class FlightControl:
             order=self._inbox.order(now_s),
             uptime_s=now_s - self._started_s,
             energy=self._energy(now_s, vehicle, odometry),
-            lands_beside_m=self._look_where_to_land(peers, silent),
+            lands_beside_m=self._update_landing_place(peers, silent),
             fell_silent=self.fell_silent,
             px4_change=self.px4_change,
         )
@@ -204,14 +202,14 @@ class FlightControl:
         )
         return sent is not None and not failsafe_acts(vehicle)
 
-    def _hear_time(self, ground: GroundState, at_s: float) -> None:
-        if at_s == self._time_heard_at_s or ground.time_s is None:
+    def _update_time(self, ground: GroundState, at_s: float) -> None:
+        if at_s == self._time_received_at_s or ground.time_s is None:
             return
-        self._time_heard_at_s = at_s
-        before = self._ground_said
-        # What was overtaken on its way is not its newest word.
+        self._time_received_at_s = at_s
+        before = self._ground_time
+        # An overtaken state has an earlier time.
         if before is None or before.base != ground.time_base or before.time_s < ground.time_s:
-            self._ground_said = FleetTime(ground.time_base, ground.time_s, 0.0)
+            self._ground_time = FleetTime(ground.time_base, ground.time_s, 0.0)
         echo = ground.echoes.get(str(self.assignment.robot.robot_id))
         if echo is not None and echo.boot_nonce == self.assignment.robot.boot_nonce:
             self._pac.clock.hear(
@@ -223,41 +221,41 @@ class FlightControl:
             )
 
     def ground_age_s(self, now_s: float) -> float:
-        """How old the ground's newest word is, s; infinite if none came. From any thread.
+        """Age of the ground's newest state, s; infinite before the first. Thread-safe.
 
-        One that was held up on its way is as old as it is at least.
+        It includes the least possible transit time.
         """
-        heard_s, said = self._inbox.ground_age_s(now_s), self._ground_said
-        age = None if said is None else self._pac.clock.age_s(said, now_s)
-        return heard_s if age is None else max(heard_s, age.least_s)
+        since_arrival_s, sent = self._inbox.ground_age_s(now_s), self._ground_time
+        age = None if sent is None else self._pac.clock.age_s(sent, now_s)
+        return since_arrival_s if age is None else max(since_arrival_s, age.least_s)
 
-    def look_back(self, silent_since_s: float, now_s: float) -> None:
-        """Nothing was sent between these times, as the watchdog counts it.
+    def note_silence(self, silent_since_s: float, now_s: float) -> None:
+        """Record the time without a setpoint, as the watchdog counts it.
 
-        A tick that took long began in time, and only this tells that the watchdog may have acted.
+        A long tick may have started on time, although the watchdog has acted during it.
         """
         if exceeds_silence(self.assignment.robot, now_s - silent_since_s):
             self.flight = replace(self.flight, tick_at_s=silent_since_s)
 
     @property
     def endurance_s(self) -> float:
-        """How long a full battery lasts, as measured in flight, or else as configured."""
+        """A full battery's flight time, s: measured in flight, or configured."""
         return self._consumption.endurance_s
 
     def failed_checks(self, now_s: float) -> tuple[FailedCheck, ...] | None:
-        """Failed checks; None if nobody looked lately. From any thread."""
+        """Failed checks; None without recent ones. Thread-safe."""
         checks = self.checks
         if checks is None or now_s - checks.at_s > _MAX_CHECKS_AGE_S:
             return None
-        # The same one, not an equal one: what was set in between may be on its way to the vehicle.
+        # Identity, not equality: another assignment in between may be on its way to the vehicle.
         if checks.assignment is not self.assignment:
             return None
         return (*checks.failed, *self.not_taken)
 
     def leave(self, on_stop: Action) -> Action | None:
-        """Request to the vehicle that it was flying when the program ends; None if it was not.
+        """Final request to the vehicle at the program's end; None if the program does not fly it.
 
-        Once the control loop has ended. Nothing is taken from a pilot, or from PX4's failsafe.
+        Call it after the last tick. It takes no control from a pilot or PX4's failsafe.
         """
         if self.flight.state is FlightState.ARMING:
             return Action.DISARM
@@ -265,11 +263,11 @@ class FlightControl:
         obeys = vehicle.mode in (Mode.OFFBOARD, Mode.HOLD) and not failsafe_acts(vehicle)
         return on_stop if self.flight.state in STEERED and obeys else None
 
-    def _take_up(self, ground: GroundState, vehicle: VehicleState) -> None:
-        """Take what the ground sets for a flight, on the ground only.
+    def _adopt(self, ground: GroundState, vehicle: VehicleState) -> None:
+        """Adopt the ground's origin, fence, place and world, on the ground only.
 
-        A program that has not flown its vehicle, such as one that was started in flight, takes it
-        at any time: it steers nothing by it. What is out of its reach it never takes.
+        A program that has not flown its vehicle, such as one started in flight, adopts them at any
+        time, since it does not steer. It never adopts an origin or fence out of reach.
         """
         now, armed = self.assignment, vehicle.armed
         origin = now.origin if ground.origin is None else ground.origin
@@ -277,7 +275,7 @@ class FlightControl:
         self.wanted_world_id = None
         if self._has_flown and not (armed is False and self.flight.state in ON_GROUND):
             fence, place = self._configured.told(ground)
-            told = {
+            parts = {
                 CheckCode.KEEPS_ORIGIN: ("mission origin", origin, now.origin),
                 CheckCode.KEEPS_FENCE: ("fence", fence, now.robot.fence),
                 CheckCode.KEEPS_PLACE: ("place", place, now.robot.place),
@@ -286,7 +284,7 @@ class FlightControl:
             where = "in flight" if armed else "not known to be on the ground"
             self.not_taken = tuple(
                 FailedCheck(code, f"{where}: keeps its {what}")
-                for code, (what, new, own) in told.items()
+                for code, (what, new, own) in parts.items()
                 if new != own
             )
             return
@@ -295,7 +293,7 @@ class FlightControl:
         changes = moves or origin != now.origin
         place_m = self._place_in(origin, vehicle) if changes else None
         if changes and place_m is None and armed is not False:
-            # It may be in the air, where no preflight asks again what is out of its reach.
+            # It may be in the air, where no preflight check would find an origin out of reach.
             return
         not_taken: list[FailedCheck] = []
         if origin != now.origin:
@@ -325,7 +323,7 @@ class FlightControl:
     def _assigned(
         self, ground: GroundState, place_m: tuple[float, float] | None
     ) -> tuple[Robot, tuple[FailedCheck, ...]]:
-        """The robot with the ground's fence and place; or as it is, and why."""
+        """The robot with the ground's fence and place; or unchanged, with the reason."""
         now = self.assignment.robot
         try:
             assigned = self._configured.assigned(ground)
@@ -338,7 +336,7 @@ class FlightControl:
         return None if origin is None else self._navigation.place_in(origin.frame(), vehicle)
 
     def _assign(self, assignment: Assignment, sensor: Sensor | Camera | None) -> None:
-        """`sensor` is over the world, None if that stays."""
+        """Switch to an assignment; `sensor` is over its world, None if that is unchanged."""
         before = self.assignment
         if assignment == before:
             return
@@ -348,14 +346,14 @@ class FlightControl:
             frame = origin.frame()
             self._navigation.frame, self._pac.frame_id = frame, frame.frame_id
             self._last_places.clear()
-            self._last_words.clear()
+            self._last_flying.clear()
             self._last_beacons.clear()
             self._pac.forget()
         if sensor is not None:
             self._pac.sensor = sensor
             self._pac.forget()
         log.info(
-            "taken up from the ground",
+            "adopted from the ground",
             origin=origin and asdict(origin),
             fence=asdict(robot.fence),
             place=asdict(robot.place),
@@ -363,29 +361,31 @@ class FlightControl:
         )
 
     def _neighbours(self, peers: tuple[ReceivedBeacon, ...], now_s: float) -> tuple[Neighbour, ...]:
-        """Robots to keep away from: also those whose policies are silent."""
+        """Robots to keep away from, with or without a running policy."""
         return tuple(
             Neighbour(
                 beacon.robot_id,
                 beacon.position_m,
                 beacon.velocity_m_s,
-                max(now_s - heard.sent_at_s, 0.0),
+                max(now_s - peer.sent_at_s, 0.0),
                 beacon.state is FlightState.PILOT or _is_off_height(beacon),
             )
-            for heard in peers
-            if now_s - heard.received_at_s <= _KEEPS_AWAY_S
-            and (beacon := heard.beacon).frame_id == self._pac.frame_id
+            for peer in peers
+            if now_s - peer.received_at_s <= _NEIGHBOUR_TIMEOUT_S
+            and (beacon := peer.beacon).frame_id == self._pac.frame_id
             and beacon.position_m is not None
             and beacon.velocity_m_s is not None
         )
 
-    def _revoked_places(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
-        """Robots that are not listened to any more, where they were: they may still hover there."""
-        for neighbour in heard:
+    def _revoked_places(
+        self, neighbours: tuple[Neighbour, ...], now_s: float
+    ) -> tuple[Neighbour, ...]:
+        """Revoked robots at their last places, where they may still hover."""
+        for neighbour in neighbours:
             self._last_places[neighbour.robot_id] = neighbour, now_s - neighbour.age_s
         if not self.revoked:
             return ()
-        silent = self.revoked.intersection(self._last_places) - {n.robot_id for n in heard}
+        silent = self.revoked.intersection(self._last_places) - {n.robot_id for n in neighbours}
         stay = []
         for robot_id in sorted(silent):
             last, at_s = self._last_places[robot_id]
@@ -396,33 +396,33 @@ class FlightControl:
     def _silent(
         self,
         peers: tuple[ReceivedBeacon, ...],
-        heard: tuple[Neighbour, ...],
+        neighbours: tuple[Neighbour, ...],
         silence: SilenceLimits,
         now_s: float,
     ) -> tuple[Neighbour, ...]:
-        """Robots that last told their place in flight, and tell none now: they may come down there.
+        """Robots that fell silent in flight, and may come down at their last place.
 
-        Who is not listened to any more is none of these: its last word may have been a lie.
+        Revoked robots are left out: their last beacon may be a thief's.
         """
-        for heard_beacon in peers:
-            beacon = heard_beacon.beacon
+        for peer in peers:
+            beacon = peer.beacon
             if beacon.armed is False:
-                self._last_words.pop(beacon.robot_id, None)
+                self._last_flying.pop(beacon.robot_id, None)
             elif (
                 beacon.armed
                 and beacon.position_m is not None
                 and beacon.velocity_m_s is not None
                 and beacon.frame_id == self._pac.frame_id
             ):
-                self._last_words[beacon.robot_id] = heard_beacon
-        others = {self.assignment.robot.robot_id, *(n.robot_id for n in heard), *self.revoked}
+                self._last_flying[beacon.robot_id] = peer
+        others = {self.assignment.robot.robot_id, *(n.robot_id for n in neighbours), *self.revoked}
         return tuple(
-            replace(told, age_s=now_s - self._last_words[robot_id].received_at_s)
-            for robot_id in sorted(self._last_words.keys() - others)
-            if (told := last_word(self._last_words[robot_id].beacon, silence)) is not None
+            replace(last, age_s=now_s - self._last_flying[robot_id].received_at_s)
+            for robot_id in sorted(self._last_flying.keys() - others)
+            if (last := last_word(self._last_flying[robot_id].beacon, silence)) is not None
         )
 
-    def _look_where_to_land(
+    def _update_landing_place(
         self, peers: tuple[ReceivedBeacon, ...], silent: tuple[Neighbour, ...]
     ) -> Point | None:
         frame_id, robot = self._pac.frame_id, self.assignment.robot
@@ -441,7 +441,7 @@ class FlightControl:
         if not standing:
             self._lands_beside_m = None
             return None
-        # Of two who look for a place, the lower one is first.
+        # Of two robots that choose a place, the lower one has priority.
         return_first = [
             beacon.position_m[:2]
             for beacon in others.values()
@@ -465,7 +465,7 @@ class FlightControl:
     ) -> Closest | None:
         if odometry is None:
             return None
-        # What the robot itself tells of its height.
+        # As in the robot's own beacon.
         height = height_m(self.flight, odometry) or 0.0
         return nearest((*odometry.position_m[:2], height), neighbours)
 

@@ -11,7 +11,7 @@ from edge.robot.config import RobotConfig
 
 
 def open_log(config: RobotConfig, bundle_id: str, boot_nonce: int) -> FlightLog:
-    """Begin it where the configuration says; `bundle_id` is in hexadecimal."""
+    """Open the log in the configured folder; `bundle_id` is in hexadecimal."""
     metadata = FlightMetadata(
         robot_id=config.robot_id,
         boot_nonce=boot_nonce,
@@ -20,7 +20,7 @@ def open_log(config: RobotConfig, bundle_id: str, boot_nonce: int) -> FlightLog:
         configuration=json.dumps(dataclasses.asdict(config), default=str),
         version=version("lpac-edge"),
     )
-    # The log's thread makes the messages: nothing of them can delay or end a control tick.
+    # The log's thread makes the messages, so that they can neither delay nor end a control tick.
     ticks = TickWriter()
     flight = ROBOT_TOPICS["flight"]._replace(
         convert=lambda _, tick: ticks.message(FlightTick(**tick))

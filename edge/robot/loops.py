@@ -1,8 +1,7 @@
-"""Threads that run steps on absolute deadlines, and how well they keep them.
+"""Threads that run steps on absolute deadlines, with statistics of their lateness.
 
-A loop that is late does not run twice to catch up: it leaves out the deadlines that have passed. A
-step that raises is logged and counted, and the loop goes on; what the step should have made grows
-old, and whoever uses it sees that.
+A late loop skips the deadlines that have passed. A step that raises is logged and counted, and the
+loop continues: users of its results see them grow old.
 """
 
 import math
@@ -32,19 +31,19 @@ class Loop:
         self._succeeded_s: float | None = None
 
     def start(self) -> int:
-        """Begin; the first tick is now. Returns the thread's number in the system."""
+        """Start the thread, with a tick at once. Returns the thread's native id."""
         self._thread.start()
         assert self._thread.native_id is not None
         return self._thread.native_id
 
     def stop(self, timeout_s: float) -> bool:
-        """No further tick; whether the thread has ended, within `timeout_s`."""
+        """End the loop after the present tick. Returns whether it ended within `timeout_s`."""
         self._stop.set()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     def status(self) -> LoopStatus:
-        """Counts since the start, and the lateness over the last minute. Called from any thread."""
+        """Counts since the start, and the lateness over the last minute. Thread-safe."""
         latenesses_ms = sorted(1e3 * late_s for late_s in self._latenesses_s.copy()) or [0.0]
         return LoopStatus(
             ticks=self._ticks,
@@ -56,7 +55,7 @@ class Loop:
         )
 
     def age_s(self) -> float | None:
-        """Since the last tick that succeeded, s; None before the first. Called from any thread."""
+        """Time since the last successful tick, s; None before the first. Thread-safe."""
         succeeded_s = self._succeeded_s
         return None if succeeded_s is None else time.monotonic() - succeeded_s
 
@@ -82,7 +81,7 @@ class Loop:
             self._failures += 1
             if self._stop.is_set():
                 return  # The program ends, and has closed what the step waited for.
-            # The first of a row says all; a log that fills the disk helps nobody.
+            # Ever more rarely, so that repeated failures cannot fill the disk.
             if self._failures & (self._failures - 1) == 0:
                 log.error(
                     "loop step failed", exc_info=error, loop=self.name, failures=self._failures

@@ -19,14 +19,14 @@ from edge.core.vehicle import (
 )
 from edge.flight.guidance import MissionPosition, MissionSetpoint
 
-# At 20 Hz, a dozen positions that did not come.
+# A dozen missing positions at 20 Hz.
 MAX_POSITION_AGE_S = 0.6
-_PLACE_POSITION_AGE_S = 0.25
+_MAX_SETPOINT_POSITION_AGE_S = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fixed:
-    """A transform, and the two origins that it holds for."""
+    """A transform, and the two origins for which it is valid."""
 
     frame: MissionFrame
     local_origin: GlobalOrigin
@@ -34,19 +34,19 @@ class _Fixed:
 
 
 class Navigation:
-    """Knows where the robot is (an OdometrySource). Every method may be called from any thread.
+    """The robot's position (an OdometrySource). Thread-safe.
 
-    `frame`, `datum_m` and `position` are replaced whole by the control thread: where the mission
-    frame lies, the altitude of the robot's takeoff point, and what the position is worth.
+    The control thread replaces `frame` (the mission frame), `datum_m` (the takeoff point's
+    altitude) and `position` (the position's quality) whole.
 
-    Altitudes are as if the estimate had never jumped in height since the vehicle was armed: it did
-    not move then, and must not for that, through the heights of others.
+    Height jumps of the estimate since arming are subtracted from altitudes: the vehicle did not
+    move then, and must not move through others' heights because of a jump.
     """
 
     def __init__(
         self, vehicle: Vehicle, clock_s: Callable[[], float], limits: PositionLimits
     ) -> None:
-        """`clock_s` is the monotonic clock of the vehicle's times, s."""
+        """Take the vehicle's monotonic clock as `clock_s`, s."""
         self._vehicle = vehicle
         self._clock_s = clock_s
         self._limits = limits
@@ -55,14 +55,14 @@ class Navigation:
         self.frame: MissionFrame | None = None
         self.datum_m: float | None = None
 
-    def look(self, vehicle: VehicleState, now_s: float) -> None:
-        """Judge the position anew, a few times a second. Called from the control thread alone."""
+    def update(self, vehicle: VehicleState, now_s: float) -> None:
+        """Judge the position's quality, a few times a second. Control thread only."""
         self.position = judge(self.position, vehicle, self._limits, now_s)
 
     def odometry(self) -> Odometry | None:
-        """Position and velocity, z being the height above the takeoff point; 0 before takeoff.
+        """Position and velocity; z is the height above the takeoff point, 0 before takeoff.
 
-        None, too, for an armed vehicle whose takeoff point is not known.
+        None if the estimate is, or if the vehicle is armed and its takeoff point unknown.
         """
         vehicle = self._vehicle.state()
         estimate = self.estimate(vehicle)
@@ -73,7 +73,7 @@ class Navigation:
         return Odometry((x_m, y_m, height_m), estimate.velocity_m_s)
 
     def estimate(self, vehicle: VehicleState) -> Odometry | None:
-        """The same with z being the altitude above sea level, less what it jumped in flight.
+        """Position and velocity; z is the altitude above sea level, less its jumps in flight.
 
         None when lost or too old.
         """
@@ -103,16 +103,16 @@ class Navigation:
         origin, position_m = vehicle.origin, vehicle.position_local_m
         if origin is None or position_m is None or not self._is_known(vehicle):
             return None
-        # For people: the geodesic would take fifty times as long.
+        # Exact enough for display: the geodesic takes fifty times as long.
         north_m, east_m = m_per_deg(origin.latitude_deg)
         longitude_deg = (origin.longitude_deg + position_m[1] / east_m + 180.0) % 360.0 - 180.0
         return origin.latitude_deg + position_m[0] / north_m, longitude_deg
 
     def to_local(self, setpoint: MissionSetpoint, vehicle: VehicleState) -> Setpoint | None:
-        """The setpoint in the vehicle's local frame; None when there is no telling.
+        """The setpoint in the vehicle's local frame; None if the transform is unknown.
 
-        A place becomes a standstill while the position does not come: the estimator's origin may
-        have jumped, and the same numbers be another place.
+        Without fresh positions, a position setpoint becomes a zero velocity: the estimator's origin
+        may have jumped, and the same numbers mean another place.
         """
         transform = self._transform(vehicle)
         if transform is None:
@@ -120,7 +120,7 @@ class Navigation:
         if isinstance(setpoint, MissionPosition):
             if self.datum_m is None:
                 return None
-            if self._clock_s() - vehicle.position_at_s > _PLACE_POSITION_AGE_S:
+            if self._clock_s() - vehicle.position_at_s > _MAX_SETPOINT_POSITION_AGE_S:
                 return Velocity((0.0, 0.0, 0.0))
             x_m, y_m, height_m = setpoint.position_m
             place_m = np.array([x_m, y_m, height_m + self.datum_m + vehicle.height_jumped_m])

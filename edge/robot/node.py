@@ -1,6 +1,6 @@
-"""One robot: its parts, and the steps that somebody else times.
+"""One robot: its parts, and their steps.
 
-Nothing here has a clock, a thread or a socket of its own. On a drone, threads call the steps
+It has no clock, thread or socket of its own. On a drone, threads call the steps
 (`edge.robot.process`); in the simulator, one simulated clock does.
 """
 
@@ -51,18 +51,18 @@ from edge.robot.pac import Pac, PolicyTick
 from edge.robot.readiness import Readiness
 
 _EXPLORED_PERIOD_S = 1.0
-# Of an armed vehicle nobody asks whether it may take off; its checks are only shown.
+# The checks of an armed vehicle are only displayed.
 _ARMED_CHECKS_PERIOD_S = 0.95
-# A status without news; what is new goes at once. A little less, since ticks are never early.
+# Without an urgent change. A little less than the rate's, since ticks are never early.
 _STATUS_PERIOD_S = 1.0 / STATUS.rate_hz - 0.05
-# What is said of each neighbour is long, and counts for the difference over many seconds.
+# The counts are long, and used for differences over many seconds.
 _RADIO_COUNTS_PERIOD_S = 1.9
-# After as many of the policy's periods without a message, or so long, a beacon goes alone: others
-# forget one after 3 s.
+# A beacon is sent alone after the shorter of these, in policy periods and s, without a message:
+# neighbours forget a robot after 3 s.
 _SILENT_TICKS, _SILENT_S = 1.5, 1.0
-# Where it commands the vehicle, and may set it back to what it was.
+# States in which it commands the vehicle, and may restore its settings.
 _STEERS = (FlightState.ARMING, *AIRBORNE)
-# Of what is logged whole.
+# Fields of messages that are logged whole.
 _FIELDS: dict[type, tuple[str, ...]] = {
     VehicleState: VehicleState.__struct_fields__,
     **{
@@ -76,7 +76,7 @@ _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still runni
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Ports:
-    """The outside world of one robot."""
+    """One robot's interfaces to the outside."""
 
     clock: Clock
     vehicle: Vehicle
@@ -87,10 +87,12 @@ class Ports:
 
 
 class RobotNode:
-    """One robot. Each `*_step` belongs to one thread; `receive`'s callbacks to any number.
+    """One robot. Call each `*_step` from one thread; the subscriptions' callbacks are thread-safe.
 
-    It speaks and hears by its guard, and until it has a link (`attach`), nobody hears it.
-    `boot_nonce` tells this start of its program from others.
+    It publishes and receives through its guard, and publishes nothing before `attach`. `boot_nonce`
+    identifies this start of its program. `host_alarms` are the computer's, and `identity_problem`
+    is why the identity cannot be written, both set by the process. `status` is the last one, None
+    before the first.
     """
 
     def __init__(
@@ -103,7 +105,7 @@ class RobotNode:
         *,
         boot_nonce: int,
     ) -> None:
-        """`world` is the text of its world file. Raises ValueError if that cannot be used."""
+        """Take the text of a world file as `world`. Raises ValueError if it cannot be used."""
         clock = ports.clock
         self._config = config
         self._ports = ports
@@ -113,7 +115,6 @@ class RobotNode:
         self._fed_s = -math.inf
         self._guard = guard
         self._link: Link | None = None
-        # What it knows: its place, the ground's mail, its map and its neighbours.
         self._navigation = Navigation(ports.vehicle, clock.monotonic_s, config.position)
         self._inbox = Inbox(config.robot_id, config.flight.ground_timeout_s, guard.release)
         self._pac = Pac(
@@ -142,29 +143,24 @@ class RobotNode:
             bundle_id=self._bundle_id,
             bundle_problem=policy.problem,
         )
-        # Why its identity cannot be written, said by whoever writes it.
         self.identity_problem = ""
         self._statuses = 0
-        # What it said last of itself: there before anybody can have heard it.
         self.status: RobotStatus | None = None
-        # Of its computer, as the program's owner found it.
         self.host_alarms: tuple[Reason, ...] = ()
-        # What the ground was told last, and when.
-        self._told: tuple[object, ...] = ()
-        self._told_at_s = -math.inf
-        self._radio_counts_told_at_s = -math.inf
+        # Urgent values of the last published status.
+        self._published: tuple[object, ...] = ()
+        self._published_at_s = -math.inf
+        self._radio_counts_at_s = -math.inf
         self._message_at_s = -math.inf
-        # How many messages the policy had, and their bytes; how many beacons went alone.
+        # Count of the policy's messages, and their bytes; count of beacons sent alone.
         self._sent = (0, 0)
         self._sent_alone = 0
-        self._told_problems: set[str] = set()
+        self._warned: set[str] = set()
         self._explored_due_s = -math.inf
-
-    # What comes
 
     @property
     def subscriptions(self) -> Mapping[Topic, ReceiveCallback]:
-        """Subscriptions: topic -> callback with the key and the data, from any thread."""
+        """Subscriptions for the link: topic -> callback with the key and the data."""
         return self._guard.subscriptions(
             {
                 MESSAGE: self._receive_message,
@@ -176,23 +172,22 @@ class RobotNode:
         )
 
     def attach(self, link: Link) -> None:
-        """Set the link to publish on from now on."""
+        """Publish on this link from now on."""
         self._link = self._guard.wrap(link)
 
     def _receive_state(self, _: str, data: bytes, sender: Sender) -> None:
-        self._inbox.put_ground(data, sender, self._ports.clock.monotonic_s())
+        self._inbox.receive_ground(data, sender, self._ports.clock.monotonic_s())
 
     def _receive_hold(self, _: str, data: bytes, sender: Sender) -> None:
-        self._inbox.put_hold(data, sender, self._ports.clock.monotonic_s())
+        self._inbox.receive_hold(data, sender, self._ports.clock.monotonic_s())
 
     def _receive_order(self, _: str, data: bytes, sender: Sender) -> None:
-        self._inbox.put_order(data, sender, self._ports.clock.monotonic_s())
+        self._inbox.receive_order(data, sender, self._ports.clock.monotonic_s())
 
     def _receive_world(self, _: str, data: bytes, __: Sender) -> None:
-        self._inbox.put_world(data)
+        self._inbox.world = data
 
     def _receive_message(self, key: str, data: bytes, sender: Sender) -> None:
-        """A robot's: to the table of neighbours, and what came to the log."""
         now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
         robot_id = robot_id_in(key)
         if robot_id is None:
@@ -202,7 +197,7 @@ class RobotNode:
             release = "" if sender.release == self._guard.release else sender.release.hex()
             beacon = decode_beacon(data, robot_id, release)
         except MessageError:
-            self._inbox.put_stranger(f"robot {robot_id}", now_s)
+            self._inbox.receive_unreadable(robot_id, now_s)
         else:
             age_s = self._pac.age_s(beacon, now_s)
             rejection = self._pac.receive(beacon, sender.number, data[BEACON_BYTES:], now_s)
@@ -217,23 +212,21 @@ class RobotNode:
             },
         )
 
-    # Its steps
-
     def control_step(self) -> None:
-        """Read the newest of everything, decide, send at most one setpoint; the rate of control."""
+        """Decide from the newest inputs, and send at most one setpoint."""
         clock = self._ports.clock
         self._control.revoked = self._guard.revoked_robots()
         flying = self._control.tick(clock.monotonic_s())
         self._ports.watchdog.feed(flying=flying)
         now_s = clock.monotonic_s()
-        self._control.look_back(self._fed_s, now_s)
+        self._control.note_silence(self._fed_s, now_s)
         self._fed_s = now_s
 
     def perception_step(self) -> None:
-        """Look at the world; the rate of perception."""
+        """Perceive, record, and publish the explored map once a second."""
         now_s = self._ports.clock.monotonic_s()
         tick = self._pac.perceive(now_s)
-        self._tell_once(self._pac.problem)
+        self._warn_once(self._pac.problem)
         if now_s >= self._explored_due_s:
             self._explored_due_s = now_s + _EXPLORED_PERIOD_S
             self._publish(EXPLORED, explored_to_bytes(self._pac.explored()))
@@ -245,21 +238,21 @@ class RobotNode:
             )
 
     def policy_step(self) -> None:
-        """Hear the neighbours, decide where to fly, tell the neighbours; the policy's rate."""
+        """Run the policy on the neighbours' messages, and publish its own message."""
         tick = self._pac.infer(self._ports.clock.monotonic_s(), on_ground=self.on_ground)
-        self._tell_once(self._pac.problem)
+        self._warn_once(self._pac.problem)
         if tick is None:
             return
         self._publish_message(tick.message)
         self._ports.recorder.record("policy", self._ports.clock.unix_s(), _fields(tick))
 
-    def _tell_once(self, problem: str) -> None:
-        if problem and problem not in self._told_problems:
-            self._told_problems.add(problem)
-            log.warning("what sensor or policy gives is not used", why=problem)
+    def _warn_once(self, problem: str) -> None:
+        if problem and problem not in self._warned:
+            self._warned.add(problem)
+            log.warning("sensor or policy result not used", why=problem)
 
     def _publish_message(self, of_policy: bytes = b"") -> None:
-        """To the neighbours: a beacon, and behind it what the policy says, if it does."""
+        """Publish a beacon, and the policy's message after it, if there is one."""
         control, vehicle = self._control, self._ports.vehicle.state()
         now_s = self._ports.clock.monotonic_s()
         assignment, gps = control.assignment, vehicle.gps
@@ -286,21 +279,21 @@ class RobotNode:
         self._publish(MESSAGE, data)
 
     def try_sensor(self) -> str:
-        """Describe the fault of a reading at its own height where it lands; "" if there is none.
+        """Describe the fault of a sensor reading over its landing point; "" if there is none.
 
-        For a robot that is only checked: its loops do not run.
+        For `lpac robot check`, without running loops.
         """
         flight = self._control.assignment.robot.parameters
         x_m, y_m = flight.landing_point_m
         return self._pac.try_sensor((x_m, y_m, flight.slot_height_m))
 
     def preflight_step(self) -> None:
-        """Prepare and check the vehicle, a few times a second; it may wait for the vehicle.
+        """Prepare and check the vehicle, a few times a second; may wait for the vehicle.
 
-        One that is armed is not about to take off: it is only watched, and less often.
+        An armed vehicle is checked less often.
         """
         control = self._control
-        self._look_for_world()
+        self._load_world()
         assignment = control.assignment
         if not self._checks_are_due(self._ports.clock.monotonic_s()):
             return
@@ -309,22 +302,22 @@ class RobotNode:
         )
         control.px4_change = self.readiness.px4_change
         now_s = self._ports.clock.monotonic_s()
-        # A robot's own wall clock may be wrong: there is no internet on a field.
+        # The robot's own wall clock may be behind: there is no internet in the field.
         ground_unix_s = self._inbox.ground_unix_s(now_s)
         if ground_unix_s is not None:
             self._guard.receive_time(max(ground_unix_s, self._ports.clock.unix_s()))
         for robot_id in self._guard.pop_unreadable_robots():
-            self._inbox.put_stranger(f"robot {robot_id}", now_s)
+            self._inbox.receive_unreadable(robot_id, now_s)
         time = self._pac.clock.at(now_s)
         control.checks = self.readiness.checks(
             now_s,
             assignment=assignment,
             position=self._navigation.position,
             odometry=self._navigation.odometry(),
-            peers=self._pac.table.heard(now_s, BEACON_LASTS_S),
-            strangers=self._inbox.strangers(now_s),
+            peers=self._pac.table.beacons(now_s, BEACON_LASTS_S),
+            unreadable_robots=self._inbox.unreadable_robots(now_s),
             ground_release=self._inbox.other_release,
-            unheard=self._inbox.unheard(now_s, self._pac.table),
+            missing_robots=self._inbox.missing_robots(now_s, self._pac.table),
             fell_silent=control.fell_silent,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),
@@ -343,8 +336,8 @@ class RobotNode:
         changed = checks.assignment is not self._control.assignment
         return changed or now_s - checks.at_s >= _ARMED_CHECKS_PERIOD_S
 
-    def _look_for_world(self) -> None:
-        """Make a sensor of the world that the ground wants, once that has come."""
+    def _load_world(self) -> None:
+        """Make a sensor over the ground's world, once the world has arrived."""
         wanted, data = self._control.wanted_world_id, self._inbox.world
         if wanted is None or data is None:
             return
@@ -359,21 +352,21 @@ class RobotNode:
             self._control.world = GroundWorld(wanted, sensor, "")
 
     def status_step(self, loops: Mapping[str, LoopStatus]) -> RobotStatus:
-        """Say how it is to the ground and to the log, a few times a second.
+        """Publish and record the status, a few times a second.
 
-        `loops` are the loops that call the steps, by their names.
+        `loops` has the status of each loop that calls the steps, by name.
         """
         now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
         self.status = status = self._status(now_s, unix_now_s, loops)
-        news = _news(status)
-        if news != self._told or now_s - self._told_at_s >= _STATUS_PERIOD_S:
-            self._told, self._told_at_s = news, now_s
+        urgent = _urgent_values(status)
+        if urgent != self._published or now_s - self._published_at_s >= _STATUS_PERIOD_S:
+            self._published, self._published_at_s = urgent, now_s
             if status.radio_counts is not None:
-                self._radio_counts_told_at_s = now_s
+                self._radio_counts_at_s = now_s
             self._publish(STATUS, encode(status))
         silent_s = min(_SILENT_TICKS / self._config.rates.policy_hz, _SILENT_S)
         if now_s - self._message_at_s > silent_s:
-            # The policy is silent, or hangs: neighbours must not lose this robot's place.
+            # The policy is silent or hangs: neighbours must not lose this robot's position.
             self._publish_message()
         vehicle = self._ports.vehicle.state()
         self._ports.recorder.record("status", unix_now_s, _fields(status))
@@ -458,7 +451,7 @@ class RobotNode:
             gps_accuracy_m=None if gps is None else gps.accuracy_m,
             radio_counts=(
                 self._radio_counts()
-                if now_s - self._radio_counts_told_at_s >= _RADIO_COUNTS_PERIOD_S
+                if now_s - self._radio_counts_at_s >= _RADIO_COUNTS_PERIOD_S
                 else None
             ),
         )
@@ -466,47 +459,46 @@ class RobotNode:
     def _alarms(self) -> tuple[Reason, ...]:
         alarms = [*self.host_alarms]
         if self._is_duplicate():
-            text = f"another program says that it is robot {self._config.robot_id}"
+            text = f"another program uses the id of robot {self._config.robot_id}: stop it"
             alarms.append(Reason(ReasonCode.DUPLICATE_ID, text))
-        twice = sorted(self._guard.duplicate_robots() - {self._config.robot_id})
-        if twice:
-            text = f"two programs have the key of robot {', '.join(map(str, twice))}: end one, or "
-            alarms.append(Reason(ReasonCode.SAID_TWICE, f"{text}revoke it and restart the robot"))
+        duplicates = sorted(self._guard.duplicate_robots() - {self._config.robot_id})
+        if duplicates:
+            ids = ", ".join(map(str, duplicates))
+            text = f"two programs have the key of robot {ids}: end one, or revoke it and restart "
+            alarms.append(Reason(ReasonCode.SAID_TWICE, f"{text}the robot"))
         if not self._ports.watchdog.alive():
             text = "the watchdog has ended: only PX4 notices if this program hangs"
             alarms.append(Reason(ReasonCode.WATCHDOG_ENDED, text))
         if not self._ports.recorder.recording:
-            text = "the flight log is not written: make room on its disk, or mend that"
+            text = "the flight log is not written: free space on its disk, or replace the disk"
             alarms.append(Reason(ReasonCode.LOG_NOT_WRITTEN, text))
         if self.identity_problem:
-            text = f"what the next start has to know is not written: {self.identity_problem}"
+            text = f"the number of this start cannot be written: {self.identity_problem}"
             alarms.append(Reason(ReasonCode.IDENTITY_NOT_WRITTEN, text))
         if not self._guard.is_member():
-            text = "its key is not in the fleet's list of members: nobody hears it"
+            text = "its key is not in the fleet's list of members: all members ignore it"
             alarms.append(Reason(ReasonCode.NOT_A_MEMBER, text))
         if differ := self._guard.members_differ():
             alarms.append(Reason(ReasonCode.MEMBERS_DIFFER, differ))
         if self._inbox.ground_refusal:
-            text = f"the ground is not understood: {self._inbox.ground_refusal}"
+            text = f"the ground's state cannot be read: {self._inbox.ground_refusal}"
             alarms.append(Reason(ReasonCode.GROUND_NOT_UNDERSTOOD, text))
         return tuple(alarms)
 
-    # Besides
-
     @property
     def on_ground(self) -> bool:
-        """Whether it is in a state of the ground."""
+        """Whether its flight state is one on the ground."""
         return self._control.flight.state in ON_GROUND
 
     @property
     def failed_checks(self) -> tuple[FailedCheck, ...] | None:
-        """Failed checks; None while the checks are still running."""
+        """Failed checks; None while the checks are running."""
         return self._control.failed_checks(self._ports.clock.monotonic_s())
 
     def leave(self, on_stop: Action) -> Action | None:
-        """Request to a vehicle that it flew, when its program ends; None if there is none.
+        """Final request to a vehicle that it flies, when its program ends; None if it does not.
 
-        Once its control step is called no more.
+        Call it after the last control step.
         """
         return self._control.leave(on_stop)
 
@@ -515,7 +507,7 @@ class RobotNode:
             self._link.publish(topic, data)
 
     def _message_counts(self) -> dict[str, int]:
-        """Counts of all that came, from the policy's messages out to the radio's."""
+        """Counts of received messages, accepted or refused, from the policy out to the radio."""
         not_admitted = 0 if self._link is None else self._link.refused()
         besides = {"not_admitted": not_admitted, "not_understood": self._inbox.not_understood_count}
         counts = self._pac.table.counts() | self._guard.refused()
@@ -533,8 +525,8 @@ class RobotNode:
     def _is_duplicate(self) -> bool:
         robot_id = self._config.robot_id
         is_claimed = self._link is not None and self._link.is_claimed(robot_id)
-        is_heard = self._pac.table.is_own_id_heard(self._ports.clock.monotonic_s())
-        return is_claimed or is_heard or robot_id in self._guard.duplicate_robots()
+        is_received = self._pac.table.is_own_id_received(self._ports.clock.monotonic_s())
+        return is_claimed or is_received or robot_id in self._guard.duplicate_robots()
 
 
 def _fields(value: RobotStatus | VehicleState | PolicyTick) -> dict[str, object]:
@@ -542,8 +534,8 @@ def _fields(value: RobotStatus | VehicleState | PolicyTick) -> dict[str, object]
     return dict(zip(_FIELDS[kind], _VALUES[kind](value), strict=True))
 
 
-def _news(status: RobotStatus) -> tuple[object, ...]:
-    """Values whose change the ground is to hear of at once; of texts only what they are about."""
+def _urgent_values(status: RobotStatus) -> tuple[object, ...]:
+    """Values of which a change is published at once; codes in place of texts."""
     return (
         status.state, status.reason.code, status.ready, status.orders, status.obeyed_sequence,
         status.operator, status.trial, status.world_id, status.origin, status.fence, status.armed,

@@ -1,8 +1,8 @@
-"""One robot's perception, action and communication, as steps that somebody else times.
+"""One robot's perception, action and communication, as steps without a clock of their own.
 
 Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
 Perception-Action-Communication Loops". The robot calls these steps from threads, the simulator in
-simulated time; both run this code.
+simulated time.
 """
 
 import functools
@@ -56,8 +56,8 @@ Position = tuple[float, float, float]  # in the mission frame, m
 class PacParameters(Bounded):
     """The fleet's settings of the loop; ages in s, see `NeighbourTable` for `max_message_age_s`.
 
-    Features, and then an action, that are older than `max_input_age_s` are not used: two ticks of
-    the policy may be missed, then the robot stops.
+    Features older than `max_input_age_s` are not used, nor is an older action: the robot tolerates
+    two missed ticks of the policy, then stops.
     """
 
     scale: ModelScale
@@ -68,9 +68,9 @@ class PacParameters(Bounded):
 
 
 def message_bytes(policy: Policy, payload: PayloadType) -> tuple[int, int]:
-    """Size of a robot's message, beacon and envelope included, if its numbers do not compress.
+    """Sizes of a robot's message, with beacon and envelope: without a map, and with the largest.
 
-    Without its map, and with one that does not compress either: most maps do.
+    Both if nothing compresses: most maps do.
     """
     perception = policy.manifest.perception
     side = perception.shared_map_side if perception else 0
@@ -79,7 +79,7 @@ def message_bytes(policy: Policy, payload: PayloadType) -> tuple[int, int]:
     return around + least, around + most
 
 
-# The robots of one process, as in a simulator, hear the same bytes within a moment.
+# In a simulator, the robots of one process decode the same bytes in turn.
 @functools.lru_cache(maxsize=8)
 def _decode(data: bytes, **own: Any) -> AggregatedMessage | Rejection:
     return decode(data, **own)
@@ -92,7 +92,7 @@ class _Timed(NamedTuple, Generic[_Array]):
     time_s: float
 
 
-class _Told(NamedTuple):
+class _OutgoingMap(NamedTuple):
     """Map for the neighbours, and its mission."""
 
     trial: int
@@ -103,8 +103,8 @@ class _Told(NamedTuple):
 class PolicyTick:
     """Record of one `Pac.infer`.
 
-    From `features` and the `payloads` of `senders`, for a node of `degree` neighbours, came
-    `velocity` (2,), in model units, and `message`, the bytes for the neighbours behind a beacon.
+    The inputs are `features`, the `payloads` of `senders`, and `degree`, the count of neighbours.
+    The outputs are `velocity` (2,), in model units, and `message`, sent after a beacon.
     """
 
     features: F32
@@ -118,8 +118,8 @@ class PolicyTick:
 class Pac:
     """The steps of one robot.
 
-    `perceive` (with `explored`) and `infer` belong to one thread each, the rest to any number. They
-    exchange immutable values by reference and never wait for one another.
+    Call `perceive` and `explored` from one thread, `infer` from one thread, the rest from any. They
+    exchange immutable values by reference and never wait for each other.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Pac:
         odometry: OdometrySource,
         parameters: PacParameters,
     ) -> None:
-        """Raises BundleError if no robot can fly the policy, ValueError for an impossible id."""
+        """Raise BundleError if no robot can fly the policy, ValueError for an impossible id."""
         require(RobotId, robot_id, "robot_id")
         manifest = policy.manifest
         if manifest.perception is None:
@@ -152,28 +152,27 @@ class Pac:
         )
         self._memory = RobotMemory(manifest.perception)
         self._agent = policy.agent()
-        # Set by whoever wants it, done by the thread that the memory, or the agent, belongs to.
+        # Set from any thread, obeyed by the thread of the memory or of the agent.
         self._forget_map = False
         self._reset_agent = False
-        # The mission that it is in, and that of its map: maps of another mission are not merged.
+        # The present mission, and the map's: maps of another mission are not merged.
         self._trial = self._map_trial = 0
-        # Replaced as a whole, before the features, so that no message is sent without a map.
-        self._told = _Told(0, None)
+        # Replaced whole, before the features, so that no message is sent without a map.
+        self._outgoing_map = _OutgoingMap(0, None)
         self._features: _Timed[F32] | None = None
-        # The velocity (2,) that `control` gives.
+        # The result of `control`.
         self._action: _Timed[F64] | None = None
         self.clock = FleetClock()
         self.table = NeighbourTable(robot_id, parameters.max_message_age_s)
         self._sensor_problem = self._observe_problem = self._step_problem = ""
-        # Replaced whole when the ground sets another origin or another world, which it does while
-        # nobody flies.
+        # Replaced whole when the ground sets another origin or world, before a flight.
         self.frame_id = 0
         self.sensor = sensor
 
     def forget(self, trial: str = "") -> None:
-        """Start anew, with the mission `trial`: no explored map and no messages. From any thread.
+        """Clear the explored map and the messages for the mission `trial`. Thread-safe.
 
-        The last action is left to the next tick of the policy, so that the robot need not stop.
+        The last action stays until the policy's next tick, so that the robot need not stop.
         """
         self._trial = zlib.crc32(trial.encode())
         self._forget_map = True
@@ -182,7 +181,7 @@ class Pac:
         self.table.clear()
 
     def beacon(self, now_s: float) -> Beacon:
-        """Beacon that precedes a message sent now, with the fields known to this robot."""
+        """The beacon of a message sent now, with the fields known here."""
         odometry = self._finite_odometry()
         return Beacon(
             robot_id=self._robot_id,
@@ -196,9 +195,9 @@ class Pac:
     def receive(
         self, beacon: Beacon, number: Number, data: bytes, now_s: float
     ) -> Rejection | None:
-        """Take in what another robot says; returns, and counts, why its policy is not listened to.
+        """Receive another robot's message; returns, and counts, the reason to reject it.
 
-        `data` is what is behind the beacon, nothing if its policy is silent.
+        `data` follows the beacon; it is empty if the robot's policy is silent.
         """
         message: AggregatedMessage | Rejection | None
         if not data:
@@ -214,15 +213,15 @@ class Pac:
         return self.table.receive(beacon, number, message, now_s, self.age_s(beacon, now_s))
 
     def age_s(self, beacon: Beacon, now_s: float) -> float | None:
-        """How old a beacon is at most; None if that is not known."""
+        """Greatest possible age of a beacon, s; None if unknown."""
         age = None if beacon.sent is None else self.clock.age_s(beacon.sent, now_s)
         return None if age is None else age.most_s
 
     def perceive(self, now_s: float) -> Perceived | None:
-        """Sensor view -> robot map -> features, as the policy makes them.
+        """Sensor view -> robot map -> the policy's features.
 
-        None when there is nothing to perceive: no position, no valid view, or no valid features.
-        Raises PartError if sensor or policy raise anything.
+        None without a position, a valid view, or valid features. Raises PartError if sensor or
+        policy raise anything.
         """
         if self._forget_map:
             self._forget_map = False
@@ -238,60 +237,59 @@ class Pac:
         view, seen = looked
         self._memory.observe(own, view, seen)
         neighbours = self.table.neighbours(now_s)
-        heard = self._to_model([_position_m(each) for each in neighbours])
-        near = neighbours_in_range(own, heard, self._perception.communication_range)
+        positions = self._to_model([_position_m(each) for each in neighbours])
+        near = neighbours_in_range(own, positions, self._perception.communication_range)
         trial = self._map_trial
         for (_, message, _), is_near in zip(neighbours, near, strict=True):
             if is_near and message.shared is not None and message.trial == trial:
                 self._memory.hear(message.shared)
-        self._told = _Told(trial, self._memory.tell(own))
-        # Outside the world the policy is told the nearest point of it, where training kept the
-        # robots: it never sees an input that it could not have been trained on.
+        self._outgoing_map = _OutgoingMap(trial, self._memory.tell(own))
+        # Training keeps robots in the world: outside it, the policy gets the nearest point inside.
         position = clamp_to_world(own, self._perception.world_size)
         velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)
         velocity = self._parameters.scale.velocity_to_model(velocity_m_s)
         local_map = self._memory.local_map(position)
-        perceived = self._observe(Observation(position, local_map, heard[near], velocity))
+        perceived = self._observe(Observation(position, local_map, positions[near], velocity))
         if perceived is None:
             return None
         self._features = _Timed(perceived.features, now_s)
         return perceived
 
     def explored(self) -> Bools:
-        """Explored map, as `mission.explored_to_bytes` takes it; valid until the robot goes on."""
+        """Explored map for `mission.explored_to_bytes`; valid until the next `perceive`."""
         return self._memory.explored
 
     def infer(self, now_s: float, *, on_ground: bool = False) -> PolicyTick | None:
         """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
 
-        None when there is nothing to send: no fresh features, no position, or a result that is
-        not as `PolicyStep` has it. Then the action is left to grow old, and `control` stops the
-        robot. Raises PartError if the policy raises anything, and leaves it likewise.
+        None without fresh features, a position, or a valid `PolicyStep`. The last action then grows
+        old, and `control` stops the robot; so it does when this raises. Raises PartError if the
+        policy raises anything.
 
-        `on_ground`: what is sent is as large as in flight, so that a radio can be tried there.
+        `on_ground`: the message is as large as in flight, to test the radio.
         """
         features, odometry = self._features, self._finite_odometry()
         if features is None or odometry is None or self._is_old(features, now_s):
             return None
         (own,) = self._to_model([odometry.position_m])
-        # Before the swap, which may take messages away: the neighbours are more than these.
-        heard = self.table.neighbours(now_s)
+        # Before the swap, which may remove messages: not all neighbours have sent a new one.
+        neighbours = self.table.neighbours(now_s)
         received = self.table.swap(now_s)
-        near = self._in_range(own, [_position_m(each) for each in (*received, *heard)])
-        near, heard_near = near[: len(received)], near[len(received) :]
-        degree = max(int(heard_near.sum()), int(near.sum()))
-        heeded = [each for each, is_near in zip(received, near, strict=True) if is_near]
-        payloads = tuple(each.message.payload for each in heeded)
+        near = self._in_range(own, [_position_m(each) for each in (*received, *neighbours)])
+        near, neighbours_near = near[: len(received)], near[len(received) :]
+        degree = max(int(neighbours_near.sum()), int(near.sum()))
+        used = [each for each, is_near in zip(received, near, strict=True) if is_near]
+        payloads = tuple(each.message.payload for each in used)
         step = self._step(features.value, payloads, degree)
         if step is None:
             return None
         velocity, payload = step
         velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(velocity.astype(np.float64))
         self._action = _Timed(limit_speed(velocity_m_s, self._parameters.max_speed_m_s), now_s)
-        message = AggregatedMessage(payload, *self._told)
+        message = AggregatedMessage(payload, *self._outgoing_map)
         return PolicyTick(
             features=features.value,
-            senders=tuple(each.beacon.robot_id for each in heeded),
+            senders=tuple(each.beacon.robot_id for each in used),
             payloads=payloads,
             degree=degree,
             velocity=velocity,
@@ -299,9 +297,9 @@ class Pac:
         )
 
     def control(self, now_s: float) -> F64 | None:
-        """The velocity (2,) in the mission frame, m/s, within the speed limit.
+        """The action: velocity (2,) in the mission frame, m/s, within the speed limit.
 
-        None when there is no fresh action.
+        None without a fresh action.
         """
         action = self._action
         return None if action is None or self._is_old(action, now_s) else action.value
@@ -309,16 +307,15 @@ class Pac:
     @property
     def problem(self) -> str:
         """Describe the fault of the sensor's, or the policy's, last result; "" if there is none."""
-        # They are set in the threads of perception and of the policy.
         of_sensor, of_policy = self._sensor_problem, self._observe_problem or self._step_problem
         if of_sensor:
             return f"sensor: {of_sensor}"
         return f"policy: {of_policy}" if of_policy else ""
 
     def try_sensor(self, position_m: Position) -> str:
-        """Describe the fault of a reading from there, mission frame; "" if there is none.
+        """Describe the fault of a sensor reading at a position; "" if there is none.
 
-        For a robot that is only checked: nothing may perceive meanwhile.
+        For `lpac robot check`, without a concurrent `perceive`.
         """
         (own,) = self._to_model([position_m])
         with suppress(PartError):
@@ -326,12 +323,12 @@ class Pac:
         return self._sensor_problem
 
     def action_age_s(self, now_s: float) -> float | None:
-        """The age of the policy's newest answer, s; None if there is none."""
+        """Age of the policy's newest action, s; None without one."""
         action = self._action
         return None if action is None else now_s - action.time_s
 
     def feature_age_s(self, now_s: float) -> float | None:
-        """The age of the newest features, s; None if there are none."""
+        """Age of the newest features, s; None without any."""
         features = self._features
         return None if features is None else now_s - features.time_s
 
@@ -343,24 +340,24 @@ class Pac:
         return odometry if all(map(math.isfinite, numbers)) else None
 
     def _look(self, own: F64, height_m: float) -> tuple[F32, Bools | None] | None:
-        """The sensor's view, and where it saw, if that is not everywhere; None without that."""
+        """The sensor's view, and the seen part if not all; None without a valid view."""
         shown: tuple[F32, Bools | None] | None
         try:
             sensor = self.sensor
-            # As isinstance(sensor, Camera), which takes many times as long.
+            # isinstance(sensor, Camera) takes many times as long.
             if hasattr(sensor, "look"):
                 shown = sensor.look(own, height_m * self._parameters.scale.env_scale)
             else:
                 view = sensor.view(own)
                 shown = None if view is None else (view, None)
             view, seen = (None, None) if shown is None else shown
-        except Exception as error:  # a sensor may be anybody's, as a policy may
+        except Exception as error:  # Sensors and policies may be third-party code.
             self._sensor_problem = in_one_line(error)
             raise self._raised("sensor", self._sensor_problem) from error
         if view is None:
             self._sensor_problem = "it shows nothing"
             return None
-        # One cell that is not finite would stay in the map.
+        # A cell that is not finite would stay in the map.
         problem = array_problem("view", view, (self._perception.sensor_size,) * 2)
         if seen is not None and not problem:
             problem = array_problem("seen", seen, view.shape)
@@ -370,7 +367,6 @@ class Pac:
         return None if problem else (view, seen)
 
     def _observe(self, observation: Observation) -> Perceived | None:
-        """The policy's result from an observation, if that can be used."""
         try:
             perceived = self._agent.observe(observation)
         except Exception as error:
@@ -380,7 +376,6 @@ class Pac:
         return None if self._observe_problem else perceived
 
     def _step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep | None:
-        """The policy's decision, if that can be used."""
         try:
             if self._reset_agent:
                 self._reset_agent = False
@@ -392,11 +387,11 @@ class Pac:
         self._step_problem = step_problem(step, self._policy.message_size)
         return None if self._step_problem else step
 
-    def _raised(self, whose: str, what: str) -> PartError:
-        return PartError(f"robot {self._robot_id}: {whose}: {what}")
+    def _raised(self, part: str, problem: str) -> PartError:
+        return PartError(f"robot {self._robot_id}: {part}: {problem}")
 
     def _in_range(self, own: F64, positions_m: Sequence[Position]) -> npt.NDArray[np.bool_]:
-        """(n,): which of the positions are within communication range of `own`, in model units."""
+        """Whether each position (n, 3) is within communication range of `own`, in model units."""
         return neighbours_in_range(
             own, self._to_model(positions_m), self._perception.communication_range
         )
@@ -412,5 +407,5 @@ class Pac:
 
 def _position_m(received: ReceivedMessage) -> Position:
     position_m = received.beacon.position_m
-    assert position_m is not None  # Or it would not have been taken.
+    assert position_m is not None  # `Pac.receive` has rejected it otherwise.
     return position_m

@@ -1,9 +1,9 @@
-"""One robot's program: a node on the real clock, its drivers, and the threads that call its steps.
+"""One robot's program: a node, its drivers, and the threads that call its steps.
 
-Threads: the three loops (`perception`, `policy`, `control`); `status`; `log`, which waits for the
-disk; `preflight`, which waits for the vehicle while that stands on the ground; zenoh's and MAVSDK's
-own, whose callbacks only store; and the main thread, which waits for signals, tells systemd that
-the control loop lives, and does nothing that could hang.
+Threads: the three loops `perception`, `policy` and `control`; `status`; `log`, which waits for the
+disk; `preflight`, which waits for the vehicle; zenoh's and MAVSDK's own, whose callbacks only
+store; and the main thread. The main thread waits for signals, reports to systemd that the control
+loop runs, and does nothing that could hang.
 """
 
 import ctypes
@@ -50,27 +50,27 @@ from edge.robot.loops import Loop
 from edge.robot.node import Ports, RobotNode
 from edge.robot.pac import message_bytes
 
-# Of preflight checks, status, systemd's news, and writing the flight log.
+# Period of preflight checks, status, reports to systemd, and writing the flight log.
 _PERIOD_S = 0.25
-# The ground tells its time to those who speak, and only a robot's own program perceives.
-_ONLY_OF_A_ROBOT = (CheckCode.TIME_NOT_KNOWN, CheckCode.NO_FRESH_ANSWER)
-# Of how the loops keep time, which is told of a whole minute.
+# Checks of a running robot: `check` publishes nothing, so it gets no time, and does not perceive.
+_ONLY_RUNNING = (CheckCode.TIME_NOT_KNOWN, CheckCode.NO_FRESH_ANSWER)
+# Period of the loops' statistics, which cover a minute.
 _LOOPS_PERIOD_S = 1.0
-# A control loop without a tick for longer hangs: the vehicle was told to hold before that.
+# A control loop without a tick for longer hangs; the watchdog has acted before.
 _CONTROL_FRESH_S = 1.0
-# On leaving: for the autopilot's answer, and for a loop that hangs.
+# Timeouts at the program's end: for the autopilot's answer, and for a loop to end.
 _ANSWER_S = 1.2
 _JOIN_S = 0.3
-# The interpreter lets another thread run this often: a tick must not wait 5 ms for each other one.
+# Python's default lets a tick wait 5 ms for each other thread.
 _SWITCH_INTERVAL_S = 0.001
-# glibc gives each thread that allocates an arena of its own, and none of them ever shrinks.
+# glibc gives each allocating thread an arena of its own, and arenas never shrink.
 _M_ARENA_MAX = -8
-# What is larger goes back to the system when it is freed; left alone, glibc keeps ever more.
+# Larger blocks return to the system when freed; glibc's own threshold grows.
 _M_MMAP_THRESHOLD, _LARGE_BYTES = -3, 2**19
 
 
 def _load(config: RobotConfig, parts: ExitStack) -> tuple[VerifiedPolicy, SensorOver, str]:
-    """Policy, sensor and world, before anything that moves. Raises ValueError or OSError."""
+    """Load policy, sensor and world. Raises ValueError or OSError."""
     policy = load_verified_policy(Path(config.policy.bundle))
     payload = config.policy.payload_of(policy.policy.manifest.payload_types)
     least_bytes, _ = message_bytes(policy.policy, payload)
@@ -78,28 +78,30 @@ def _load(config: RobotConfig, parts: ExitStack) -> tuple[VerifiedPolicy, Sensor
         raise ConfigError(
             f"link: group = {config.link.group!r}: a message of {config.policy.bundle} in "
             f"{payload} has {least_bytes} bytes, and a group takes {MOST_BYTES}: "
-            "take another payload, or another transport"
+            "choose another payload or transport"
         )
     sensor = config.sensor
     sensor_over = parts.enter_context(
         open_sensor(sensor.type, sensor.options, policy.policy.manifest)
     )
     world = Path(config.policy.world).read_text("utf-8-sig")
-    sensor_over(world, config.policy.world)  # or say what is wrong with it now
+    sensor_over(world, config.policy.world)  # Raises now for an unusable world.
     return policy, sensor_over, world
 
 
 def run(config: RobotConfig, stop: Stop) -> None:
-    """Fly one robot until `stop` is set. Called from the main thread.
+    """Fly one robot until `stop` is set. Call it from the main thread.
 
-    Raises ValueError or OSError, in one line, for what keeps the program from starting.
+    At the end a vehicle in flight holds or lands, then everything is closed.
+
+    Raises ValueError or OSError, in one line, if the program cannot start.
     """
     libc = ctypes.CDLL(None)
     libc.mallopt(_M_ARENA_MAX, 1)
     libc.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
     allow_most_descriptors()
     with ExitStack() as parts:
-        # 1. Policy, sensor and world, before anything that moves.
+        # Before anything that moves.
         policy, sensor_over, world = _load(config, parts)
         if stop.is_set():
             return
@@ -108,17 +110,14 @@ def run(config: RobotConfig, stop: Stop) -> None:
         bundle_id, boot_nonce = policy.policy.bundle_id.hex(), secrets.randbits(48)
         service_manager = ServiceManager()
         parts.callback(service_manager.close)
-        # 2. One program per robot on this machine.
         parts.enter_context(_robot_lock(config))
-        # 3. The flight log, so that it holds all that follows.
+        # Early, so that the log holds all that follows.
         recorder = open_log(config, bundle_id, boot_nonce)
         parts.callback(recorder.close)
         log_to(recorder)
-        # 4. The vehicle, and who holds it when this program hangs.
         vehicle, setup, new_watchdog = parts.enter_context(_open_vehicle(config))
         flight = config.flight
         watchdog = parts.enter_context(new_watchdog(flight.command_timeout_s, flight.hover_land_s))
-        # 5. The robot itself.
         identity = _identity(config, partial(load_identity, unix_s=clock.unix_s()))
         signed = None if identity is None else identity.guard(clock.monotonic_s)
         node = RobotNode(
@@ -136,26 +135,23 @@ def run(config: RobotConfig, stop: Stop) -> None:
             signed or Unguarded(int(1e3 * clock.unix_s())),
             boot_nonce=boot_nonce,
         )
-        # 6. The radio that feeds it, and takes what it says.
         link = parts.enter_context(_open_link(config, node, config.robot_id, identity, signed))
         node.attach(link)
-        # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
-        take_up = None
+        update_identity = None
         if identity is not None and signed is not None:
-            take_up = partial(identity.update, signed)
-        program = _Program(config, node, vehicle, watchdog, recorder, link, take_up)
+            update_identity = partial(identity.update, signed)
+        program = _Program(config, node, vehicle, watchdog, recorder, link, update_identity)
         gc.collect()
-        gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
-        libc.malloc_trim(0)  # What verification took goes back to the system.
+        gc.freeze()  # Spares collections in flight the objects loaded so far.
+        libc.malloc_trim(0)  # Returns the memory of the verification to the system.
         program.start()
         parts.callback(program.leave)
         parts.callback(service_manager.notify, STOPPING)
         if config.link.insecure:
-            log.warning("insecure: whoever is on the network can fly this robot")
+            log.warning("insecure: anybody on the network can fly this robot")
         log.info("robot runs", robot=config.robot_id, bundle=bundle_id[:12])
-        # 8. Until somebody stops the program.
-        while not stop.wait(_PERIOD_S):  # A signal that another thread took is seen only here.
-            service_manager.notify(*program.news())
+        while not stop.wait(_PERIOD_S):  # Also handles signals that another thread received.
+            service_manager.notify(*program.notifications())
 
 
 def _open_vehicle(config: RobotConfig) -> AbstractContextManager[OpenVehicle]:
@@ -165,7 +161,7 @@ def _open_vehicle(config: RobotConfig) -> AbstractContextManager[OpenVehicle]:
 
 
 def _identity(config: RobotConfig, load: Callable[..., Identity]) -> Identity | None:
-    """This robot's identity in its fleet; None if there is none. Raises ConfigError or OSError."""
+    """This robot's identity; None in a fleet without keys. Raises ConfigError or OSError."""
     if not config.identity.folder:
         return None
     folder = Path(config.identity.folder)
@@ -179,7 +175,7 @@ def _open_link(
     identity: Identity | None,
     members: Knocking | None,
 ) -> AbstractContextManager[Link]:
-    """The radio, as that robot, or with None as somebody who only listens."""
+    """Open the radio as that robot, or to subscribe only if None."""
     link = config.link
     setting = LinkSetting(
         config.fleet, robot_id, link.listen, link.connect, link.scouting, link.options,
@@ -190,7 +186,7 @@ def _open_link(
 
 
 def _group(config: RobotConfig, identity: Identity | None) -> Group | None:
-    """Raises ConfigError for a member that was given no key of the group."""
+    """The multicast group, if any. Raises ConfigError for a member without a group key."""
     if not config.link.group:
         return None
     address, port = require_group("group", config.link.group)
@@ -201,7 +197,7 @@ def _group(config: RobotConfig, identity: Identity | None) -> Group | None:
             return GroupKeys((open_key,), open_key)
         if identity.group_keys is None:
             raise ConfigError(
-                f"{config.identity.folder}: {GROUP_KEYS} is missing, which multicast needs: run "
+                f"{config.identity.folder}: {GROUP_KEYS} is missing, and multicast needs it: run "
                 "`lpac fleet up`"
             )
         return identity.group_keys
@@ -211,9 +207,9 @@ def _group(config: RobotConfig, identity: Identity | None) -> Group | None:
 
 
 class _Program:
-    """The threads of a running robot. The main thread calls its methods.
+    """The threads of a running robot. Call its methods from the main thread.
 
-    `take_up` follows the fleet's list of members, and writes the number of this start.
+    `update_identity` rereads the fleet's list of members, and writes the number of this start.
     """
 
     def __init__(
@@ -224,7 +220,7 @@ class _Program:
         watchdog: Watchdog,
         recorder: FlightLog,
         link: Link,
-        take_up: Callable[..., None] | None,
+        update_identity: Callable[..., None] | None,
     ) -> None:
         self._config = config
         self._node = node
@@ -232,14 +228,14 @@ class _Program:
         self._watchdog = watchdog
         self._link = link
         self._recorder = recorder
-        self._take_up = take_up
+        self._update_identity = update_identity
         rates = config.rates
         self._loops = (
             Loop("control", 1.0 / rates.control_hz, node.control_step),
             Loop("perception", 1.0 / rates.perception_hz, node.perception_step),
             Loop("policy", 1.0 / rates.policy_hz, node.policy_step),
         )
-        # A vehicle that falls silent holds up the first for many seconds.
+        # A silent vehicle may block `preflight` for many seconds.
         self._chores = (
             Loop("preflight", _PERIOD_S, node.preflight_step),
             Loop("status", _PERIOD_S, self._status_step),
@@ -250,25 +246,25 @@ class _Program:
         self._loops_due_s = -math.inf
 
     def start(self) -> None:
-        """Start the loops; from now on the robot may send."""
+        """Start the loops."""
         for loop in (*self._loops, *self._chores):
             thread = loop.start()
-            with suppress(OSError):  # for whoever looks with `top -H`, and for the bench
+            with suppress(OSError):  # Thread names for `top -H` and the bench.
                 Path(f"/proc/self/task/{thread}/comm").write_text(loop.name)
 
-    def news(self) -> list[str]:
-        """Messages to systemd of the present state. Waits for nothing."""
-        news = [] if self._status_text is None else [self._status_text]
+    def notifications(self) -> list[str]:
+        """Notifications to systemd of the present state. Does not block."""
+        notifications = [] if self._status_text is None else [self._status_text]
         ages_s = [loop.age_s() for loop in self._loops]
         if None not in ages_s:
-            news.append(READY)
+            notifications.append(READY)
         control_s = ages_s[0]
         if control_s is not None and control_s < _CONTROL_FRESH_S:
-            news.append(ALIVE)
-        return news
+            notifications.append(ALIVE)
+        return notifications
 
     def leave(self) -> None:
-        """Leave a vehicle that we flew in a defined state, and stop the loops."""
+        """Make a vehicle in flight hold or land, and stop the loops."""
         control, *others = self._loops
         self._stop(control)
         action = self._node.leave(Action(self._config.on_stop))
@@ -276,7 +272,7 @@ class _Program:
             log.warning("program ends in flight", vehicle=action)
             self._command(action)
         preflight, *chores = self._chores
-        preflight.stop(_JOIN_S)  # It may wait for the vehicle, whose closing ends that.
+        preflight.stop(_JOIN_S)  # It may wait for the vehicle, until that is closed.
         for loop in (*others, *chores):
             self._stop(loop)
 
@@ -286,7 +282,7 @@ class _Program:
 
     def _command(self, action: Action) -> None:
         asked_s = time.monotonic()
-        # Or the watchdog would interrupt it. If it does not arrive, PX4 lands the vehicle.
+        # Keeps the watchdog from interrupting it. If the command is lost, PX4 lands the vehicle.
         self._watchdog.feed(flying=False)
         self._vehicle.command(action)
         while time.monotonic() - asked_s < _ANSWER_S:
@@ -297,9 +293,9 @@ class _Program:
         log.error("the autopilot did not answer", action=action)
 
     def _write_step(self) -> None:
-        if self._take_up is not None:
+        if self._update_identity is not None:
             try:
-                self._take_up(in_flight=not self._node.on_ground)
+                self._update_identity(in_flight=not self._node.on_ground)
                 self._node.identity_problem = ""
             except OSError as error:
                 if not self._node.identity_problem:
@@ -326,27 +322,27 @@ class _Program:
 
 
 def host_alarms(doors: Iterable[DoorStatus], short: str) -> Iterator[Reason]:
-    """Yield the operator's alarms: flooded or full radio ports, and short descriptors."""
+    """Yield alarms about the computer: flooded or full radio ports, and few descriptors left."""
     if short:
-        yield Reason(ReasonCode.DESCRIPTORS_SHORT, f"{short}: soon nobody can connect")
+        yield Reason(ReasonCode.DESCRIPTORS_SHORT, f"{short}: new connections will fail soon")
     for door in doors:
         if door.flooded:
-            text = f"strangers flood its radio port: {door.refused} refused; members get in"
+            text = f"strangers flood its radio port: {door.refused} refused; members can connect"
             yield Reason(ReasonCode.STRANGERS_FLOOD, text)
         if door.queue_full:
-            text = "its radio port has a full queue: nobody new gets in"
+            text = "its radio port's queue is full: new connections fail"
             yield Reason(ReasonCode.RADIO_QUEUE_FULL, text)
 
 
 def _robot_lock(config: RobotConfig) -> ProcessLock:
-    """Another program on this machine must not be this robot too."""
+    """Lock against another program of this robot on this machine."""
     return ProcessLock(f"robot {config.robot_id} of fleet {config.fleet}")
 
 
 class CheckReport(NamedTuple):
-    """Findings of `check`: PX4's reactions, what was set, and what keeps the robot from flying.
+    """Findings of `check`: PX4's reactions, changed parameters and failed checks.
 
-    `version` is PX4's, and how far it was tried.
+    `version` is PX4's, and how well it is tested.
     """
 
     version: str
@@ -355,11 +351,8 @@ class CheckReport(NamedTuple):
     failed: tuple[FailedCheck, ...]
 
 
-class _OnlyLooking:
-    """Stands for what a robot that is only checked does not use: it is told nothing.
-
-    A vehicle that answers and obeys nobody, a watchdog with nothing to watch, a log of nothing.
-    """
+class _PassivePorts:
+    """Ports for `check`: a vehicle that is read only, no watchdog, and no log."""
 
     recording = True
 
@@ -367,26 +360,26 @@ class _OnlyLooking:
         self.state = vehicle.state
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
-        """Sends nothing."""
+        """Do nothing."""
 
     def command(self, action: Action) -> None:
-        """Asks for nothing."""
+        """Do nothing."""
 
     def feed(self, *, flying: bool) -> None:
-        """Watches nothing."""
+        """Do nothing."""
 
     def alive(self) -> bool:
-        """There is none before the robot's program runs."""
+        """Whether the watchdog works: `check` needs none."""
         return True
 
     def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
-        """Keeps nothing."""
+        """Do nothing."""
 
 
 def check(config: RobotConfig, wait_s: float) -> CheckReport:
-    """Run all preflight checks without flying, for up to `wait_s` until all of them pass.
+    """Run all preflight checks without flying, until they pass or for `wait_s`.
 
-    Raises ValueError or OSError, in one line, for what keeps the checks from running.
+    Raises ValueError or OSError, in one line, if the checks cannot run.
     """
     with ExitStack() as parts:
         policy, sensor_over, world = _load(config, parts)
@@ -395,15 +388,15 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
         clock = SystemClock()
         identity = _identity(config, receiving_identity)
         vehicle, setup, _ = parts.enter_context(_open_vehicle(config))
-        looking = _OnlyLooking(vehicle)
+        passive = _PassivePorts(vehicle)
         node = RobotNode(
             config,
             Ports(
                 clock=clock,
-                vehicle=looking,
+                vehicle=passive,
                 vehicle_setup=setup,
-                watchdog=looking,
-                recorder=looking,
+                watchdog=passive,
+                recorder=passive,
                 sensor_over=sensor_over,
             ),
             policy,
@@ -411,9 +404,9 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             Unguarded(0) if identity is None else identity.guard(clock.monotonic_s),
             boot_nonce=0,
         )
-        # Not as the robot itself: its program is not running.
+        # Subscribe only: the robot's program is not running.
         node.attach(parts.enter_context(_open_link(config, node, None, identity, None)))
-        # Of its own, since the checks wait for the vehicle; it looks as often as a flight does.
+        # In a thread of its own at flight rate, since the checks wait for the vehicle.
         control = Loop("control", 1.0 / config.rates.control_hz, node.control_step)
         control.start()
         parts.callback(control.stop, _JOIN_S)
@@ -422,7 +415,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             node.preflight_step()
             failed = node.failed_checks
             if failed is not None:
-                failed = tuple(c for c in failed if c.code not in _ONLY_OF_A_ROBOT)
+                failed = tuple(c for c in failed if c.code not in _ONLY_RUNNING)
                 problem = node.try_sensor()
                 if problem:
                     text = f"sensor {config.sensor.type}: {problem}"

@@ -1,7 +1,7 @@
-"""Readiness to fly: gathers the inputs of preflight's checks.
+"""Readiness to fly: prepare the vehicle, and gather the inputs of preflight's checks.
 
-One thread only, and not the control loop's: a vehicle that falls silent while it is asked something
-holds up the caller for many seconds.
+Call it from one thread, not the control loop's: a vehicle that does not answer may block the caller
+for many seconds.
 """
 
 import math
@@ -22,17 +22,17 @@ from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 from edge.robot.config import RobotConfig
 
-# Parameters and fence may be changed by others meanwhile, also in flight.
-_LOOK_AGAIN_S = 1.5
-_TRY_AGAIN_S = 3.0
-# What is set back in flight is looked at each second.
-_SET_BACK_WITHIN_S = 3.5
+# Others may change parameters and fence at any time.
+_READ_PERIOD_S = 1.5
+_RETRY_S = 3.0
+# A change in flight that lasts longer is not being restored.
+_RESTORED_WITHIN_S = 3.5
 
 _MAX_ANSWER_AGE_S = 2.0
 
 
 class Assignment(NamedTuple):
-    """A robot's assignment, as the ground sets it: where, its fence and place, and its world."""
+    """A robot's assignment from the ground: mission origin, fence and place, and world."""
 
     origin: Origin | None
     robot: Robot
@@ -40,7 +40,7 @@ class Assignment(NamedTuple):
 
 
 class Checks(NamedTuple):
-    """Findings of preflight at one time, for one assignment: one line for each failed check."""
+    """Failed checks at one time, for one assignment."""
 
     failed: tuple[FailedCheck, ...]
     at_s: float
@@ -48,10 +48,10 @@ class Checks(NamedTuple):
 
 
 class Readiness:
-    """The checks of one robot before flight, and whether what they found lasts in flight.
+    """The preflight checks of one robot, and the watch over its vehicle's settings in flight.
 
-    `explanations` say what PX4 would do when something fails; `changes` are the parameters that
-    were set; `px4_change` is as in `FlightInputs`.
+    `explanations` describe PX4's failsafes; `changes` are the parameters that were set;
+    `px4_change` is as in `FlightInputs`.
     """
 
     def __init__(
@@ -68,19 +68,19 @@ class Readiness:
         self._setup = setup
         self._bundle_id = bundle_id
         self._bundle_problem = bundle_problem
-        # What is later than many periods of the policy is late in flight, too.
+        # At least as long as flight tolerates.
         self._max_answer_age_s = max(_MAX_ANSWER_AGE_S, config.policy.max_input_age_s)
         self._requirements: tuple[Requirement, ...] = ()
-        # What they were made for; all else that they follow from is configured.
+        # The ceiling that they were made for; their other inputs are configured.
         self._ceiling_m: float | None = None
         self._parameter_problems: tuple[str, ...] | None = None
-        # The last that were right.
+        # The last values without a problem.
         self._right: dict[str, int | float | None] = {}
-        self._look_due_s = self._fence_due_s = -math.inf
+        self._read_due_s = self._fence_due_s = -math.inf
         self._uploaded: tuple[Origin, Fence] | None = None
-        # How often it must still be found there.
+        # Reads that must still find the fence after somebody changed it.
         self._fence_doubts = 0
-        # Of this flight.
+        # Changes in this flight.
         self.px4_change: Px4Change | None = None
         self._changed: tuple[str, ...] = ()
         self._changed_since_s = math.inf
@@ -88,10 +88,10 @@ class Readiness:
         self.changes: tuple[str, ...] = ()
 
     def prepare(self, now_s: float, assignment: Assignment, *, steers: bool = False) -> None:
-        """Read, and set if the configuration says so, what the vehicle must be.
+        """Read the vehicle's parameters and fence; on the ground, set them as configured.
 
-        The fence goes to the vehicle when the mission's origin is known. In flight, what others
-        change is set back where this program `steers`.
+        The fence is uploaded once the mission's origin is known. In flight, changes by others are
+        restored if this program `steers`.
         """
         origin, fence = assignment.origin, assignment.robot.fence
         failsafe, flight = self._config.failsafe, self._config.flight
@@ -101,34 +101,34 @@ class Readiness:
             self._forget()
         vehicle = self._vehicle.state()
         if not vehicle.connected:
-            self._look_due_s = -math.inf
-            # What flew goes on, for all that is known.
+            self._read_due_s = -math.inf
+            # A vehicle that was armed may still fly, with the same settings.
             if not vehicle.armed:
                 self._forget()
                 self._uploaded, self._fence_doubts = None, 0
             return
-        # Nothing is set while it is not sure which vehicle answers.
+        # Set nothing while the vehicle that answers is uncertain.
         if vehicle.armed is None or vehicle.other_system_ids:
             return
         if vehicle.armed:
-            if now_s >= self._look_due_s:
+            if now_s >= self._read_due_s:
                 self._watch(now_s, steers=steers)
             return
         self.px4_change, self._changed, self._changed_since_s = None, (), math.inf
-        if now_s >= self._look_due_s:
-            self._look_due_s = now_s + (_LOOK_AGAIN_S if self._read() else _TRY_AGAIN_S)
-            self._look_at_fence(now_s)
+        if now_s >= self._read_due_s:
+            self._read_due_s = now_s + (_READ_PERIOD_S if self._read() else _RETRY_S)
+            self._check_fence(now_s)
         if origin is None or self._uploaded == (origin, fence):
             return
         if now_s >= self._fence_due_s:
-            self._fence_due_s = now_s + _TRY_AGAIN_S
+            self._fence_due_s = now_s + _RETRY_S
             self._upload_fence(origin, fence)
-            # Not at once: somebody who goes on to clear it is given the time to.
-            self._look_due_s = max(self._look_due_s, now_s + _LOOK_AGAIN_S)
+            # Later, so that a repeated change by others is found.
+            self._read_due_s = max(self._read_due_s, now_s + _READ_PERIOD_S)
 
     def _forget(self) -> None:
         self._parameter_problems, self._right = None, {}
-        self._look_due_s = -math.inf
+        self._read_due_s = -math.inf
 
     def checks(
         self,
@@ -138,9 +138,9 @@ class Readiness:
         position: PositionJudgement,
         odometry: Odometry | None,
         peers: Sequence[ReceivedBeacon],
-        strangers: Sequence[str],
+        unreadable_robots: Sequence[int],
         ground_release: str,
-        unheard: Sequence[int],
+        missing_robots: Sequence[int],
         fell_silent: Sequence[Neighbour],
         duplicate: bool,
         watchdog_alive: bool,
@@ -151,7 +151,7 @@ class Readiness:
         answer_age_s: float | None,
         answer_problem: str,
     ) -> Checks:
-        """All checks, now. `ground_age_s` is infinite if the ground was never heard."""
+        """Run all checks. `ground_age_s` is infinite before the first ground state."""
         config = self._config
         origin, robot, world_id = assignment
         inputs = PreflightInputs(
@@ -176,9 +176,9 @@ class Readiness:
             min_separation_m=robot.parameters.min_separation_m,
             errors=robot.errors,
             neighbours=peers,
-            strangers=strangers,
+            unreadable_robots=unreadable_robots,
             ground_release=ground_release,
-            unheard=unheard,
+            missing_robots=missing_robots,
             fell_silent=fell_silent,
             separation=robot.separation,
             rc=config.failsafe.rc,
@@ -189,7 +189,7 @@ class Readiness:
         )
         failed = failed_checks(inputs, config.preflight)
         if not watchdog_alive:
-            text = "watchdog has ended: start this robot's program again"
+            text = "watchdog has ended: restart this robot's program"
             failed = (*failed, FailedCheck(CheckCode.WATCHDOG_ENDED, text))
         if not is_member:
             text = "its key is not in the fleet's list of members: enroll this robot again"
@@ -199,8 +199,8 @@ class Readiness:
         return Checks(failed, now_s, assignment)
 
     def _read(self) -> bool:
-        """Whether everything is as it must be."""
-        # What others have changed is told before it is set, and until the next look finds it so.
+        """Read the parameters, and set the wrong ones; returns whether all were right."""
+        # Report a change by others before setting it, and until the next read finds it restored.
         sets = self._config.failsafe.parameters == "set" and self._parameter_problems != ()
         try:
             values = self._setup.read_parameters(PARAMETERS)
@@ -214,15 +214,15 @@ class Readiness:
         if not problems:
             self._right = {each.name: values[each.name] for each in self._requirements}
         changed = "; ".join(_differences(self._right, values))
-        said_of_all = f" (changed by somebody else: {changed})" if problems and changed else ""
-        self._parameter_problems = tuple(problem + said_of_all for problem in problems)
+        suffix = f" (changed by somebody else: {changed})" if problems and changed else ""
+        self._parameter_problems = tuple(problem + suffix for problem in problems)
         timeout_s = self._config.flight.command_timeout_s
         hang = f"if this program hangs, its watchdog lets PX4 hold, {timeout_s:g} s later"
         self.explanations = (hang, *explain(values))
         return not problems
 
     def _set_wrong(self, values: dict[str, int | float | None]) -> bool:
-        """Set what is wrong and can be set; whether there was any."""
+        """Set each wrong parameter that can be set; returns whether there was any."""
         wrong = [
             (requirement, requirement.value_to_set)
             for requirement in self._requirements
@@ -240,10 +240,10 @@ class Readiness:
         self.changes = (*self.changes, change)
         log.warning("PX4 parameter set", change=change, why=why)
 
-    def _look_at_fence(self, now_s: float) -> None:
-        """Report a fence that others changed before uploading it, until two looks find it.
+    def _check_fence(self, now_s: float) -> None:
+        """Report a fence that others changed, until two reads after a new upload find it.
 
-        The first may know no more than that it was there a moment after the upload.
+        One read is not enough: it may show the moment after the upload.
         """
         if self._uploaded is None:
             return
@@ -256,10 +256,10 @@ class Readiness:
         else:
             self._fence_doubts = 2
             log.warning("fence was changed by somebody else")
-        self._uploaded, self._fence_due_s = None, now_s + _TRY_AGAIN_S
+        self._uploaded, self._fence_due_s = None, now_s + _RETRY_S
 
     def _upload_fence(self, origin: Origin, fence: Fence) -> None:
-        # Without an answer the vehicle may have this one, the one before, or none.
+        # Without an answer the vehicle may have the new fence, the former, or none.
         self._uploaded = None
         try:
             self._send_fence(origin, fence)
@@ -273,12 +273,10 @@ class Readiness:
         grown_m = fence.grown_m(self._config.failsafe.fence_margin_m)
         self._setup.upload_fence([frame.to_global_deg(*vertex) for vertex in grown_m])
 
-    # In flight
-
     def _watch(self, now_s: float, *, steers: bool) -> None:
-        """Whether all is as preflight found it; what is not is set back, if that is allowed."""
-        self._look_due_s = now_s + _LOOK_AGAIN_S
-        # Armed by others, or before this program was started: nothing was found right.
+        """Report settings that changed since preflight, and restore them if allowed."""
+        self._read_due_s = now_s + _READ_PERIOD_S
+        # Armed by others, or before this program's start: preflight has not passed.
         if self._parameter_problems or not self._right or self._uploaded is None:
             return
         try:
@@ -287,9 +285,9 @@ class Readiness:
         except OSError as error:
             log.warning("not known whether PX4 was changed", error=str(error))
             return
-        # What was not answered is not thereby changed.
+        # A parameter without an answer counts as unchanged.
         values = {n: was if read[n] is None else read[n] for n, was in self._right.items()}
-        # In flight that is the control loop's; where others set it, the position is soon lost.
+        # The control loop sets it in flight; if others do, the position is soon lost.
         values[GPS_CONTROL] = self._right.get(GPS_CONTROL)
         wrong: tuple[str, ...] = ()
         if check_parameters(self._requirements, values):
@@ -303,23 +301,23 @@ class Readiness:
             self._changed_since_s = math.inf
             if self._changed:
                 what = ", ".join(self._changed)
-                text = f"somebody changed the autopilot in flight, and it was set back: {what}"
+                text = f"somebody changed the autopilot in flight, and it was restored: {what}"
                 self.px4_change = Px4Change(text, False)
             return
         self._changed = tuple(dict.fromkeys((*self._changed, *wrong)))
         self._changed_since_s = min(self._changed_since_s, now_s)
-        stays = not may_set or now_s - self._changed_since_s > _SET_BACK_WITHIN_S
-        self._look_due_s = now_s + (_LOOK_AGAIN_S if stays else 0.0)
-        how = "and it stays so" if stays else "it is set back"
+        stays = not may_set or now_s - self._changed_since_s > _RESTORED_WITHIN_S
+        self._read_due_s = now_s + (_READ_PERIOD_S if stays else 0.0)
+        how = "not restored" if stays else "being restored"
         text = f"somebody changed the autopilot in flight, {how}: {', '.join(wrong)}"
         change = Px4Change(text, stays)
         if change != self.px4_change:
             log.warning("PX4 was changed in flight", what=wrong, stays=stays)
         self.px4_change = change
         if steers:
-            self._set_back(values if may_set else self._right, has_fence=has_fence)
+            self._restore(values if may_set else self._right, has_fence=has_fence)
 
-    def _set_back(self, values: dict[str, int | float | None], *, has_fence: bool) -> None:
+    def _restore(self, values: dict[str, int | float | None], *, has_fence: bool) -> None:
         try:
             for name, right in self._right.items():
                 if right is not None and values[name] != right:
@@ -327,7 +325,7 @@ class Readiness:
             if not has_fence and self._uploaded is not None:
                 self._send_fence(*self._uploaded)
         except OSError as error:
-            log.warning("PX4 not set back", error=str(error))
+            log.warning("PX4 not restored", error=str(error))
 
 
 def _differences(

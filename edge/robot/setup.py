@@ -1,6 +1,6 @@
-"""Sets up a vehicle once: its system id, and the parameters that decide what it does in trouble.
+"""Set up a vehicle once: its system id and failsafe parameters.
 
-Those that count after a reboot only are set here too: nobody has to do it by hand.
+Parameters that take effect after a reboot are set here, too.
 """
 
 import time
@@ -12,20 +12,20 @@ from edge.core.vehicle import VehicleState
 from edge.flight.failsafe import Requirement, check
 
 _SYSTEM_ID = "MAV_SYS_ID"
-# PX4 sends heartbeats at 1 Hz: by then a second vehicle on the link has been heard too.
+# PX4 sends heartbeats at 1 Hz, so this also detects a second vehicle on the link.
 _LISTEN_S = 2.5
 _PERIOD_S = 0.1
 
 
 class SetupError(OSError):
-    """The vehicle cannot be set up; one line says why, and what to do."""
+    """Failure to set up the vehicle; one line with the cause and the remedy."""
 
 
 class SetupReport(NamedTuple):
     """Outcome of setting up the vehicle that answers as `system_id`.
 
-    `changes` are the parameters that were set, `problems` what is wrong all the same. With
-    `needs_reboot`, some of it counts only after the autopilot was restarted.
+    `changes` are the parameters that were set, `problems` those still wrong. With `needs_reboot`,
+    some changes take effect only when the autopilot restarts.
     """
 
     system_id: int
@@ -41,10 +41,10 @@ def set_up(
     system_id: int,
     wait_s: float,
 ) -> SetupReport:
-    """Set what is wrong on the one vehicle that is heard within `wait_s`.
+    """Set the wrong parameters of the one vehicle that is received within `wait_s`.
 
-    Raises SetupError if there is none or another one beside it, or if it is not disarmed; OSError
-    if it falls silent or refuses.
+    Raises SetupError if there is none, or more than one, or if it is not disarmed; OSError if it
+    falls silent or refuses.
     """
     answers_as = _only_vehicle(autopilot, wait_s)
     names = [requirement.name for requirement in requirements]
@@ -57,12 +57,12 @@ def set_up(
             continue
         wanted = requirement.value_to_set
         if wanted is None:
-            # Counts after a reboot; the first that is allowed is the best.
+            # Takes effect after a reboot; the first allowed value is the best.
             wanted, needs_reboot = requirement.values[0], True
         _refuse_unless_disarmed(autopilot.state())
         setup.set_parameter(requirement.name, wanted)
         changes.append(f"{requirement.name} from {value:g} to {wanted:g}")
-    # The last: should the autopilot take it at once, it is another vehicle from then on.
+    # Last: an autopilot that takes it at once no longer answers as the same vehicle.
     own = before[_SYSTEM_ID]
     if own != system_id:
         _refuse_unless_disarmed(autopilot.state())
@@ -75,28 +75,27 @@ def set_up(
 
 
 def _only_vehicle(autopilot: Vehicle, wait_s: float) -> int:
-    """The system id of the one vehicle that is heard."""
     until_s = time.monotonic() + wait_s
-    heard_at_s = None
+    connected_at_s = None
     while True:
         now_s = time.monotonic()
         state = autopilot.state()
-        if state.connected and heard_at_s is None:
-            heard_at_s = now_s
-        if heard_at_s is None and now_s > until_s:
+        if state.connected and connected_at_s is None:
+            connected_at_s = now_s
+        if connected_at_s is None and now_s > until_s:
             raise SetupError(
-                f"no autopilot was heard within {wait_s:g} s: check its power, and who forwards "
-                "its MAVLink"
+                f"no autopilot connected within {wait_s:g} s: check its power, and the program "
+                "that forwards its MAVLink"
             )
-        if heard_at_s is not None and now_s - heard_at_s > _LISTEN_S:
+        if connected_at_s is not None and now_s - connected_at_s > _LISTEN_S:
             break
         time.sleep(_PERIOD_S)
     assert state.system_id is not None
     if state.other_system_ids:
         ids = ", ".join(map(str, sorted({state.system_id, *state.other_system_ids})))
         raise SetupError(
-            f"more than one vehicle is on this link (system id {ids}): leave only the one that is "
-            "to be set up"
+            f"more than one vehicle is on this link (system ids {ids}): disconnect all but the one "
+            "to set up"
         )
     _refuse_unless_disarmed(state)
     return state.system_id

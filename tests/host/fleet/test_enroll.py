@@ -201,7 +201,7 @@ def test_from_a_password_to_a_robot_of_the_fleet(
     done = lpac_fleet(fleet_file, "enroll", "r4", new.address)
     assert done.returncode == 1
     assert "not a VOXL2" in done.stdout
-    assert "no autopilot was heard within 10 s" in done.stdout
+    assert "no autopilot connected within 10 s" in done.stdout
     alone = {**dict.fromkeys(STEPS, SO_ALREADY), "vision-hub": "skipped", "PX4": LEFT}
     assert outcomes(done.stdout) == alone
 

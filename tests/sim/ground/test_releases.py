@@ -58,7 +58,7 @@ def test_in_flight_it_is_kept_clear_of_and_its_policy_is_not_heard() -> None:
     field.run(2.0)
     assert node._pac.table.neighbours(field.now_s) == ()
     assert node._pac.table.counts()[Rejection.OTHER_RELEASE] > 0
-    (told,) = node._control._neighbours(node._pac.table.heard(field.now_s, 1.0), field.now_s)
+    (told,) = node._control._neighbours(node._pac.table.beacons(field.now_s, 1.0), field.now_s)
     assert told.robot_id == 1
     assert field.states() == {_S.MISSION}
     # It is brought down as the others are.

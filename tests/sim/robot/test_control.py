@@ -209,7 +209,7 @@ class Flown:
 
     def tick(self) -> None:
         """One tenth of a second of everything."""
-        self.inbox.put_ground(encode(self.ground), ANYBODY, self.now_s)
+        self.inbox.receive_ground(encode(self.ground), ANYBODY, self.now_s)
         self.look()
         if self._ticks % 2 == 0:
             perceived = self.pac.perceive(self.now_s)
@@ -238,7 +238,7 @@ class Flown:
             order_id=str(self._orders), robot_id=3, boot_nonce=11, kind=kind,
             expires_at_uptime_s=self.now_s + 9.0, operator="test", trial=trial,
         )  # fmt: skip
-        self.inbox.put_order(encode(order), ANYBODY, self.now_s)
+        self.inbox.receive_order(encode(order), ANYBODY, self.now_s)
         self.tick()
         return self.control.flight.answers[-1]
 
@@ -348,11 +348,11 @@ def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilot
     flown.explore("a")
     now_s = flown.now_s
     # Late, but the watchdog has not acted.
-    flown.control.look_back(now_s - 0.4, now_s)
+    flown.control.note_silence(now_s - 0.4, now_s)
     flown.tick()
     assert (flown.state, flown.vehicle.mode) == (FlightState.MISSION, Px4Mode.OFFBOARD)
     flown.vehicle.set_mode(Px4Mode.HOLD)
-    flown.control.look_back(now_s - 0.5, now_s)
+    flown.control.note_silence(now_s - 0.5, now_s)
     flown.tick()
     assert flown.state is FlightState.HOLD
     assert flown.control.flight.reason == Reason(

@@ -104,7 +104,7 @@ def test_what_it_publishes_and_logs_in_ten_seconds_of_flight() -> None:
     assert 0.0 < logged["received"]["age_s"] < 0.1
     assert said.remote_control is None, "there is none to lose"
     # Its neighbour hears the same.
-    (beacon,) = (heard.beacon for heard in other._pac.table.heard(field.now_s, 1.0))
+    (beacon,) = (heard.beacon for heard in other._pac.table.beacons(field.now_s, 1.0))
     assert (beacon.state, beacon.armed, beacon.system_id) == (said.state, True, said.system_id)
     assert beacon.gps_accuracy_m == pytest.approx(said.gps_accuracy_m, abs=0.01)
     assert beacon.flown_s == pytest.approx(said.flown_s, abs=1.0)
@@ -112,8 +112,8 @@ def test_what_it_publishes_and_logs_in_ten_seconds_of_flight() -> None:
     for robot_id, data in ((5, last["message"]), (6, b"?")):
         sealed = node._guard.seal(MESSAGE, data)
         other.subscriptions[MESSAGE](f"robot/{robot_id}/message", sealed)
-    assert [h.beacon.robot_id for h in other._pac.table.heard(field.now_s, 1.0)] == [0, 5]
-    assert other._inbox.strangers(field.now_s) == ("robot 6",)
+    assert [h.beacon.robot_id for h in other._pac.table.beacons(field.now_s, 1.0)] == [0, 5]
+    assert other._inbox.unreadable_robots(field.now_s) == (6,)
     # What is new is said at once, and once.
     published.clear()
     node.identity_problem = "no room"

@@ -1328,7 +1328,7 @@ def test_battery_low_returns_and_critical_lands(world: World) -> None:
     world.until(FlightState.LANDED, 20.0)
 
 
-CHANGED = "somebody changed the autopilot in flight, and it stays so: GF_ACTION from 2 to 0"
+CHANGED = "somebody changed the autopilot in flight, not restored: GF_ACTION from 2 to 0"
 
 
 def test_an_autopilot_that_others_change_is_an_alarm(world: World) -> None:

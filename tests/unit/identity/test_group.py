@@ -92,7 +92,7 @@ def test_nobody_without_the_key_is_listened_to(data: st.DataObject) -> None:
     assert b"hello" not in piece
 
 
-def test_what_was_said_before_is_old() -> None:
+def test_replays_are_dropped() -> None:
     assembly = Assembly()
     first, second = sent(b"first", 1), sent(b"s" * 2000, 2)
     assert put_together(assembly, [*first, *second]) == [b"first", b"s" * 2000]
@@ -126,7 +126,7 @@ def test_pieces_that_do_not_belong_to_a_message_do_not_spoil_it() -> None:
         number = number._replace(sequence=number.sequence + 1)
 
 
-def test_the_former_key_is_over_for_who_has_the_new_one() -> None:
+def test_the_former_key_is_refused_after_a_sender_used_the_new_one() -> None:
     assembly = Assembly()
     assert put_together(assembly, sent(b"not yet", 1, key=FORMER)) == [b"not yet"]
     assert put_together(assembly, sent(b"stolen", 2, key=FORMER), heard=False) == [b"stolen"]

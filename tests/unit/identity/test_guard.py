@@ -1,4 +1,4 @@
-"""Only members of the fleet are heard, each only as itself."""
+"""Messages of members alone are accepted, each as its own sender's."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -40,17 +40,18 @@ def members(number: int = 1, *, without: str = "", authority: Signer = AUTHORITY
 
 
 class Member:
-    """A guard, what it hears, and what it sends: by topic, as it goes over the air."""
+    """A guard, its received messages, and its sent ones as they go over the air."""
 
     def __init__(self, own: Listed, *, start: int = 1, list_: Members | None = None) -> None:
         self.now_s = 0.0
         self.own = own
         membership = Membership(own, signer(own.name), list_ or members(), start)
         self.guard = SignedGuard(membership, lambda: self.now_s)
-        self.heard: list[tuple[str, bytes, Sender]] = []
+        self.received: list[tuple[str, bytes, Sender]] = []
         topics: Mapping[Topic, ReceiveCallback] = self.guard.subscriptions(
             dict.fromkeys(
-                (MESSAGE, STATUS, STATE, HOLD, ORDER), lambda *said: self.heard.append(said)
+                (MESSAGE, STATUS, STATE, HOLD, ORDER),
+                lambda *m: self.received.append(m),
             )
         )
         self._topics = topics
@@ -69,8 +70,8 @@ class Member:
     def refused(self) -> int:
         return 11
 
-    def say(self, topic: Topic, data: bytes) -> list[tuple[Topic, bytes]]:
-        """What goes out for it."""
+    def send(self, topic: Topic, data: bytes) -> list[tuple[Topic, bytes]]:
+        """The sealed messages."""
         self.sent = []
         self._link.publish(topic, data)
         return self.sent
@@ -79,14 +80,14 @@ class Member:
         sender = "ground" if self.own.robot_id is None else f"robot/{self.own.robot_id}"
         return f"{sender}/{topic.name}"
 
-    def hear(self, other: "Member", sent: list[tuple[Topic, bytes]], key: str = "") -> None:
+    def receive(self, other: "Member", sent: list[tuple[Topic, bytes]], key: str = "") -> None:
         for topic, data in sent:
             self._topics[topic](key or other.key(topic), data)
 
-    def takes(self, topic: Topic, key: str, data: bytes) -> bool:
-        before = len(self.heard)
+    def accepts(self, topic: Topic, key: str, data: bytes) -> bool:
+        before = len(self.received)
         self._topics[topic](key, data)
-        return len(self.heard) > before
+        return len(self.received) > before
 
 
 def robot(robot_id: int, start: int = 1, list_: Members | None = None) -> Member:
@@ -107,89 +108,89 @@ def two() -> Member:
     return robot(2)
 
 
-def test_a_program_is_heard_with_its_first_message(one: Member, two: Member) -> None:
-    ((topic, message),) = sent = two.say(MESSAGE, b"hello")
+def test_a_programs_first_message_is_accepted(one: Member, two: Member) -> None:
+    ((topic, message),) = sent = two.send(MESSAGE, b"hello")
     assert topic is MESSAGE and len(message) == len(b"hello") + OVERHEAD_BYTES
-    one.hear(two, sent)
+    one.receive(two, sent)
     number, digest = MessageNumber(1, 1), members().digest
-    assert one.heard == [
+    assert one.received == [
         ("robot/2/message", b"hello", Sender(Role.ROBOT, "r2", number, members=digest))
     ]
-    # Also of its next start, and a ground's.
-    for again, says in ((robot(2, start=2), MESSAGE), (operator(), STATE), (operator(2), STATE)):
-        one.hear(again, again.say(says, b"begun again"))
-    assert len(one.heard) == 4 and one.guard.refused() == {}
+    # Also those of its next start, and a ground's.
+    for again, topic in ((robot(2, start=2), MESSAGE), (operator(), STATE), (operator(2), STATE)):
+        one.receive(again, again.send(topic, b"restarted"))
+    assert len(one.received) == 4 and one.guard.refused() == {}
 
 
 @pytest.mark.parametrize("start", [4, 5])
-def test_its_own_words_are_no_news_whoever_says_them_again(start: int) -> None:
+def test_replays_of_its_own_messages_are_refused(start: int) -> None:
     """Also those from before its program began again, for as long as somebody goes on."""
     one, former = robot(1, start=5), robot(1, start=start)
     for second in range(20):
         one.now_s = float(second)
-        ((_, said),) = former.say(MESSAGE, b"")[-1:]
-        assert not one.takes(MESSAGE, "robot/1/message", said)
-    assert not one.heard and not one.guard.duplicate_robots()
-    # Another program with its key that began later is heard.
-    ((_, said),) = robot(1, start=6).say(MESSAGE, b"another")[-1:]
-    assert one.takes(MESSAGE, "robot/1/message", said)
+        ((_, sent),) = former.send(MESSAGE, b"")[-1:]
+        assert not one.accepts(MESSAGE, "robot/1/message", sent)
+    assert not one.received and not one.guard.duplicate_robots()
+    # Another program with its key that started later is accepted.
+    ((_, sent),) = robot(1, start=6).send(MESSAGE, b"another")[-1:]
+    assert one.accepts(MESSAGE, "robot/1/message", sent)
 
 
 @given(at=st.integers(0, 10_000), bit=st.integers(0, 7), payload=st.binary(max_size=300))
-def test_no_changed_message_is_heard(at: int, bit: int, payload: bytes) -> None:
+def test_a_changed_message_is_refused(at: int, bit: int, payload: bytes) -> None:
     one, two = robot(1), robot(2)
-    ((_, data),) = two.say(MESSAGE, payload)
+    ((_, data),) = two.send(MESSAGE, payload)
     changed = bytearray(data)
     changed[at % len(data)] ^= 1 << bit
-    assert not one.takes(MESSAGE, "robot/2/message", bytes(changed))
-    assert one.takes(MESSAGE, "robot/2/message", data)
+    assert not one.accepts(MESSAGE, "robot/2/message", bytes(changed))
+    assert one.accepts(MESSAGE, "robot/2/message", data)
 
 
 @given(st.binary(max_size=200))
 def test_no_bytes_are_a_message(data: bytes) -> None:
-    assert not robot(1).takes(MESSAGE, "robot/2/message", data)
+    assert not robot(1).accepts(MESSAGE, "robot/2/message", data)
 
 
 def test_a_message_counts_once_and_for_its_own_place_only(one: Member, two: Member) -> None:
-    ((_, data),) = two.say(MESSAGE, b"second")
-    assert not one.takes(MESSAGE, "robot/3/message", data)
-    assert not one.takes(STATUS, "robot/2/status", data)
-    assert not one.takes(STATE, "ground/state", data)
-    assert one.takes(MESSAGE, "robot/2/message", data)
-    assert not one.takes(MESSAGE, "robot/2/message", data)
-    ((_, third),) = two.say(MESSAGE, b"third")
-    ((_, fourth),) = two.say(MESSAGE, b"fourth")
-    assert one.takes(MESSAGE, "robot/2/message", fourth)
-    assert not one.takes(MESSAGE, "robot/2/message", third)
-    # Its program starts again; what the former one said is over, whatever its sequence.
+    ((_, data),) = two.send(MESSAGE, b"second")
+    assert not one.accepts(MESSAGE, "robot/3/message", data)
+    assert not one.accepts(STATUS, "robot/2/status", data)
+    assert not one.accepts(STATE, "ground/state", data)
+    assert one.accepts(MESSAGE, "robot/2/message", data)
+    assert not one.accepts(MESSAGE, "robot/2/message", data)
+    ((_, third),) = two.send(MESSAGE, b"third")
+    ((_, fourth),) = two.send(MESSAGE, b"fourth")
+    assert one.accepts(MESSAGE, "robot/2/message", fourth)
+    assert not one.accepts(MESSAGE, "robot/2/message", third)
+    # Its program restarts; messages of the former start are refused, whatever their sequence.
     again = robot(2, start=2)
-    assert one.takes(MESSAGE, "robot/2/message", again.say(MESSAGE, b"anew")[-1][1])
-    ((_, former),) = two.say(MESSAGE, b"fifth")
-    assert not one.takes(MESSAGE, "robot/2/message", former)
+    assert one.accepts(MESSAGE, "robot/2/message", again.send(MESSAGE, b"anew")[-1][1])
+    ((_, former),) = two.send(MESSAGE, b"fifth")
+    assert not one.accepts(MESSAGE, "robot/2/message", former)
     assert one.guard.refused()["replayed"] == 3
 
 
-def test_two_programs_with_one_key_are_told_from_a_new_start(one: Member, two: Member) -> None:
+def test_two_programs_with_one_key_differ_from_a_restart(one: Member, two: Member) -> None:
     again = robot(2, start=2)
 
-    def both_speak(until_s: float) -> None:
+    def both_send(until_s: float) -> None:
         while one.now_s < until_s:
             one.now_s += 0.5
-            one.hear(again, again.say(MESSAGE, b"new")[-1:])
-            one.hear(two, two.say(MESSAGE, b"old")[-1:])
+            one.receive(again, again.send(MESSAGE, b"new")[-1:])
+            one.receive(two, two.send(MESSAGE, b"old")[-1:])
 
     # What was on its way when the program started again, and then a second program.
-    both_speak(4.0)
+    both_send(4.0)
     assert one.guard.duplicate_robots() == Unguarded(1).duplicate_robots() == set()
-    both_speak(8.0)
+    both_send(8.0)
     assert one.guard.duplicate_robots() == {2}
     one.now_s += 6.0
     assert one.guard.duplicate_robots() == set()
     # One and the same message over and over is no program.
-    ((_, data),) = two.say(MESSAGE, b"once")[-1:]
+    ((_, data),) = two.send(MESSAGE, b"once")[-1:]
     for _ in range(20):
         one.now_s += 0.5
-        assert not one.takes(MESSAGE, "robot/2/message", data)
+        assert not one.accepts(MESSAGE, "robot/2/message", data)
     assert one.guard.duplicate_robots() == set()
 
 
@@ -200,52 +201,52 @@ def test_a_robots_key_is_no_operators_and_no_other_robots(one: Member, two: Memb
         (ORDER, "ground/order"),
         (STATUS, "robot/1/status"),
     ):
-        assert not one.takes(topic, key, data)
+        assert not one.accepts(topic, key, data)
     assert one.guard.refused()["not_allowed"] == 3
 
 
-def test_an_observer_says_a_hold_and_nothing_else(one: Member) -> None:
+def test_an_observer_may_send_only_a_hold(one: Member) -> None:
     observer = Member(listed(Role.OBSERVER, "guest"))
-    for member, heard in ((observer, [True, False, False]), (operator(), [True, True, True])):
-        said = [(topic, *member.say(topic, b"other")[0][1:]) for topic in (HOLD, ORDER, STATE)]
-        assert [one.takes(t, member.key(t), data) for t, data in said] == heard
-    assert [(sender.role, sender.name) for *_, sender in one.heard] == [
+    for member, accepted in ((observer, [True, False, False]), (operator(), [True, True, True])):
+        sent = [(topic, *member.send(topic, b"other")[0][1:]) for topic in (HOLD, ORDER, STATE)]
+        assert [one.accepts(t, member.key(t), data) for t, data in sent] == accepted
+    assert [(sender.role, sender.name) for *_, sender in one.received] == [
         (Role.OBSERVER, "guest"),
         *[(Role.OPERATOR, "ann")] * 3,
     ]
 
 
-def test_another_fleet_is_not_heard_even_of_the_same_name_and_key(one: Member) -> None:
+def test_another_fleet_of_the_same_name_and_key_is_refused(one: Member) -> None:
     stranger = robot(2, list_=members(authority=OTHER_FLEET))
-    one.hear(stranger, stranger.say(MESSAGE, b"hello"))
-    assert not one.heard and one.guard.refused() == {"forged": 1}
+    one.receive(stranger, stranger.send(MESSAGE, b"hello"))
+    assert not one.received and one.guard.refused() == {"forged": 1}
 
 
-def test_who_is_not_in_the_list_is_not_heard(one: Member, two: Member) -> None:
-    one.hear(two, two.say(MESSAGE, b"1"))
+def test_senders_not_in_the_list_are_refused(one: Member, two: Member) -> None:
+    one.receive(two, two.send(MESSAGE, b"1"))
     one.guard.update_members(members(2, without="r2"))
-    assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"2"))
+    assert not one.accepts(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"2"))
     assert one.guard.refused() == {"unknown_key": 1}
     # It may still be there; and one that has the list knows why nobody listens.
     assert one.guard.revoked_robots() == {2} and one.guard.is_member()
     assert two.guard.is_member() and Unguarded(1).is_member()
     two.guard.update_members(members(2, without="r2"))
     assert not two.guard.is_member() and two.guard.revoked_robots() == {2}
-    # Whoever comes back is heard; what it said before is over.
+    # A member that returns is accepted; its former messages are not.
     one.guard.update_members(members(3))
     assert one.guard.revoked_robots() == Unguarded(1).revoked_robots() == set()
-    assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"3"))
+    assert one.accepts(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"3"))
 
 
-def test_who_was_replaced_is_not_heard_any_more(one: Member, two: Member) -> None:
+def test_a_replaced_member_is_refused(one: Member, two: Member) -> None:
     swapped = listed(Role.ROBOT, "spare", 2)
     others = tuple(member for member in ALL if member.robot_id != 2)
     later = replace(members(2), members=(*others, swapped))
     one.guard.update_members(later)
     two.guard.update_members(later)
     new = Member(swapped, list_=later)
-    assert one.takes(MESSAGE, "robot/2/message", new.guard.seal(MESSAGE, b"I am two"))
-    assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"so am I"))
+    assert one.accepts(MESSAGE, "robot/2/message", new.guard.seal(MESSAGE, b"I am two"))
+    assert not one.accepts(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"so am I"))
     assert new.guard.is_member() and not two.guard.is_member()
     assert one.guard.revoked_robots() == set()
 
@@ -269,50 +270,50 @@ def test_a_list_that_is_older_or_another_fleets_is_not_taken(
     assert one.guard.members == members(2)
 
 
-def test_who_has_another_list_is_named_while_it_is_heard(one: Member, two: Member) -> None:
+def test_recent_senders_with_another_list_are_named(one: Member, two: Member) -> None:
     ground = operator()
 
-    def both_speak() -> str:
-        one.hear(two, two.say(MESSAGE, b""))
-        one.hear(ground, ground.say(STATE, b""))
+    def both_send() -> str:
+        one.receive(two, two.send(MESSAGE, b""))
+        one.receive(ground, ground.send(STATE, b""))
         return one.guard.members_differ()
 
-    assert both_speak() == Unguarded(1).members_differ() == ""
+    assert both_send() == Unguarded(1).members_differ() == ""
     ground.guard.update_members(members(2))
-    assert both_speak() == (
+    assert both_send() == (
         "the list of members here is 1, and ann has 2, which is newer: run `lpac fleet up`"
     )
     two.guard.update_members(members(2))
     one.guard.update_members(members(3))
-    assert "is 3, and r2 has 2, which is older, ann has 2, which is older:" in both_speak()
+    assert "is 3, and r2 has 2, which is older, ann has 2, which is older:" in both_send()
     two.guard.update_members(members(3, without="r4"))
     ground.guard.update_members(members(3))
-    assert "is 3, and r2 has another 3:" in both_speak()
-    # What it said before on another topic does not count, nor what it said long ago.
-    one.hear(two, two.say(STATUS, b""))
+    assert "is 3, and r2 has another 3:" in both_send()
+    # Its earlier message on another topic does not count, nor does an old one.
+    one.receive(two, two.send(STATUS, b""))
     one.now_s = 4.0
     two.guard.update_members(members(4))
     one.guard.update_members(members(4))
-    one.hear(two, two.say(MESSAGE, b""))
+    one.receive(two, two.send(MESSAGE, b""))
     assert "ann has 3" in one.guard.members_differ() and "r2" not in one.guard.members_differ()
     one.now_s = 9.5
     assert one.guard.members_differ() == ""
 
 
 def test_without_a_guard_a_message_is_its_keys() -> None:
-    heard: list[tuple[str, bytes, Sender]] = []
+    received: list[tuple[str, bytes, Sender]] = []
     guard = Unguarded(5)
-    topics = guard.subscriptions(dict.fromkeys((MESSAGE, STATE), lambda *said: heard.append(said)))
+    topics = guard.subscriptions(dict.fromkeys((MESSAGE, STATE), lambda *m: received.append(m)))
     assert topics[MESSAGE]("robot/3/message", guard.seal(MESSAGE, b"m"))
     assert topics[STATE]("ground/state", guard.seal(STATE, b"s"))
-    assert heard == [
+    assert received == [
         ("robot/3/message", b"m", Sender(Role.ROBOT, "", MessageNumber(5, 1))),
         ("ground/state", b"s", Sender(Role.OPERATOR, "", MessageNumber(5, 1))),
     ]
     # What is not in an envelope, or in a member's.
     for data in (b"m", robot(3).guard.seal(MESSAGE, b"m")):
         assert not topics[MESSAGE]("robot/3/message", data)
-    assert len(heard) == 2 and guard.refused() == {"no_envelope": 2}
+    assert len(received) == 2 and guard.refused() == {"no_envelope": 2}
 
 
 def test_the_link_itself_is_asked_for_the_rest(one: Member) -> None:
@@ -337,16 +338,16 @@ def thief(robot_id: int, ahead_ms: float, sequence: int = 2**32 - 1) -> Member:
     return member
 
 
-def speak(
-    hearer: Member, member: Member, until_s: float, topic: Topic = MESSAGE
+def exchange(
+    receiver: Member, member: Member, until_s: float, topic: Topic = MESSAGE
 ) -> list[tuple[str, bytes, Sender]]:
-    """Return what is heard of a member that speaks at 4 Hz."""
-    before = len(hearer.heard)
-    while hearer.now_s < until_s:
-        hearer.now_s += 0.25
-        member.now_s = hearer.now_s
-        hearer.hear(member, member.say(topic, b"word"))
-    return hearer.heard[before:]
+    """Messages accepted from a member that sends at 4 Hz."""
+    before = len(receiver.received)
+    while receiver.now_s < until_s:
+        receiver.now_s += 0.25
+        member.now_s = receiver.now_s
+        receiver.receive(member, member.send(topic, b"word"))
+    return receiver.received[before:]
 
 
 def packet(member: Member, topic: Topic = MESSAGE) -> list[tuple[Topic, bytes]]:
@@ -354,82 +355,82 @@ def packet(member: Member, topic: Topic = MESSAGE) -> list[tuple[Topic, bytes]]:
 
 
 @pytest.mark.parametrize("topic", [MESSAGE, STATUS])
-def test_no_start_beyond_a_day_mutes_a_robot(one: Member, topic: Topic) -> None:
+def test_a_start_beyond_a_day_silences_no_robot(one: Member, topic: Topic) -> None:
     one.guard.receive_time(NOW_S)
     two, enemy = begun(2, -60.0), thief(2, 2**48 if topic is MESSAGE else 1.1 * DAY_MS)
-    assert speak(one, two, 5.0, topic)
-    one.hear(enemy, packet(enemy, topic))
+    assert exchange(one, two, 5.0, topic)
+    one.receive(enemy, packet(enemy, topic))
     assert one.guard.refused()["start_ahead"] == 1
-    assert len(speak(one, two, 6.0, topic)) == 4
-    # And the operator is told: while the real one is heard, its key is somebody else's too.
+    assert len(exchange(one, two, 6.0, topic)) == 4
+    # While the real one is accepted, an alarm reports that its key has a second user.
     assert one.guard.duplicate_robots() == one.guard.robots_with_future_start() == {2}
-    speak(one, two, 20.0, topic)
+    exchange(one, two, 20.0, topic)
     assert one.guard.duplicate_robots() == one.guard.robots_with_future_start() == set()
 
 
 @pytest.mark.parametrize("ahead_ms", [-60e3, 0.9 * DAY_MS], ids=["its own start", "a later one"])
-def test_whom_a_thief_silenced_is_heard_again_once_it_starts_again(
+def test_a_robot_silenced_by_a_thief_is_accepted_after_its_restart(
     one: Member, ahead_ms: float
 ) -> None:
     one.guard.receive_time(NOW_S)
     two, enemy = begun(2, -60.0), thief(2, ahead_ms)
-    assert speak(one, two, 5.0)
-    one.hear(enemy, stolen := packet(enemy))
-    speak(one, two, 12.0)
+    assert exchange(one, two, 5.0)
+    one.receive(enemy, stolen := packet(enemy))
+    exchange(one, two, 12.0)
     assert one.guard.duplicate_robots() == {2}, "and others say so"
     again = begun(2, 13.0)
-    assert len(speak(one, again, 20.0)) == 32
-    # What the thief said is over, and so is what the robot said before.
-    one.hear(enemy, stolen)
-    one.hear(two, packet(two))
-    assert one.heard[-1][1] == b"word" and len(speak(one, again, 21.0)) == 4
+    assert len(exchange(one, again, 20.0)) == 32
+    # The thief's messages are refused, and so are the robot's former ones.
+    one.receive(enemy, stolen)
+    one.receive(two, packet(two))
+    assert one.received[-1][1] == b"word" and len(exchange(one, again, 21.0)) == 4
 
 
-def test_a_start_that_was_heard_before_the_time_was_known_mutes_nobody_for_good(
+def test_a_start_received_before_the_time_is_known_silences_nobody_for_good(
     one: Member,
 ) -> None:
-    """A robot that lost its clock knows the time once it hears its ground."""
+    """A robot that lost its clock gets the time from its ground."""
     two, enemy = begun(2, -60.0), thief(2, 2**48)
-    assert speak(one, two, 1.0)
-    one.hear(enemy, packet(enemy))
-    assert not speak(one, two, 3.0)
+    assert exchange(one, two, 1.0)
+    one.receive(enemy, packet(enemy))
+    assert not exchange(one, two, 3.0)
     one.guard.receive_time(NOW_S + 3.0)
-    assert speak(one, begun(2, 4.0), 5.0)
+    assert exchange(one, begun(2, 4.0), 5.0)
 
 
-def test_a_clock_that_is_set_back_makes_nobody_deaf_in_flight(one: Member) -> None:
+def test_a_clock_set_back_in_flight_refuses_nobody(one: Member) -> None:
     one.guard.receive_time(NOW_S)
     two = begun(2, -60.0)
-    assert speak(one, two, 1.0)
+    assert exchange(one, two, 1.0)
     one.guard.receive_time(NOW_S - 30 * 86_400.0)
-    assert len(speak(one, two, 2.0)) == 4 and not one.guard.robots_with_future_start()
+    assert len(exchange(one, two, 2.0)) == 4 and not one.guard.robots_with_future_start()
 
 
-def test_a_ground_is_heard_whatever_its_clock_was(one: Member) -> None:
-    """Robots in flight hear their ground, though its laptop's clock was wrong once."""
+def test_a_ground_is_accepted_whatever_its_clock_was(one: Member) -> None:
+    """Robots in flight accept their ground, though its laptop's clock was wrong once."""
     one.guard.receive_time(NOW_S)
     ground = operator(int(1e3 * NOW_S + 30 * DAY_MS))
-    assert speak(one, ground, 1.0, STATE)
+    assert exchange(one, ground, 1.0, STATE)
     # Its clock was set right, and it started again.
     again = operator(int(1e3 * (NOW_S + 2.0)))
-    assert speak(one, again, 3.0, STATE)
+    assert exchange(one, again, 3.0, STATE)
 
 
 def test_messages_that_overtake_each_other_are_no_second_program(one: Member, two: Member) -> None:
     late: list[tuple[Topic, bytes]] = []
     for quarter in range(80):
         one.now_s = 0.25 * quarter
-        said = packet(two)
-        one.hear(two, [*packet(two), *late, *late])
-        late = said
+        sent = packet(two)
+        one.receive(two, [*packet(two), *late, *late])
+        late = sent
     assert one.guard.refused()["replayed"] > 100
     assert one.guard.duplicate_robots() == set()
 
 
-def test_a_robot_hears_that_another_has_its_key(one: Member) -> None:
-    one.hear(robot(2), packet(robot(2)))
+def test_a_robot_detects_a_second_user_of_its_key(one: Member) -> None:
+    one.receive(robot(2), packet(robot(2)))
     enemy = robot(1, start=2)
-    one.hear(enemy, packet(enemy))
+    one.receive(enemy, packet(enemy))
     assert one.guard.duplicate_robots() == {1}
 
 
@@ -437,7 +438,7 @@ PLACE = "192.0.2.1:7447"
 
 
 def test_a_knock_counts_once_and_of_members_alone(one: Member) -> None:
-    """Of one that was never heard, too; a stranger who recorded it gets in nowhere with it."""
+    """Also from a new member; a recorded knock opens no port for a stranger."""
     two, ground = robot(2), operator()
     for member in (two, ground):
         knock = member.guard.knock(PLACE)
@@ -447,7 +448,7 @@ def test_a_knock_counts_once_and_of_members_alone(one: Member) -> None:
         changed = bytearray(member.guard.knock(PLACE))
         changed[-1] ^= 1
         assert not one.guard.is_knock(bytes(changed), PLACE)
-    # Nor with the own one, nor with what was said, nor as another.
+    # Nor is its own knock one, nor a message, nor a knock in another's name.
     assert not one.guard.is_knock(one.guard.knock(PLACE), PLACE)
     assert not one.guard.is_knock(two.guard.seal(MESSAGE, b""), PLACE)
     stranger = robot(2, list_=members(authority=OTHER_FLEET))
@@ -464,12 +465,12 @@ def test_no_bytes_are_a_knock(data: bytes) -> None:
 
 @pytest.mark.parametrize("robot", ["x", "-1", "03", "65536", "99999999", ""])
 def test_a_key_that_is_no_robots_is_refused(robot: str) -> None:
-    heard: list[object] = []
+    received: list[object] = []
     guard = Unguarded(start=1)
-    subscriptions = guard.subscriptions({MESSAGE: lambda *said: heard.append(said)})
+    subscriptions = guard.subscriptions({MESSAGE: lambda *m: received.append(m)})
     for data in (guard.seal(MESSAGE, b"hi"), b"LE\xff"):
         assert subscriptions[MESSAGE](f"robot/{robot}/message", data) is False
-    assert not heard and not guard.pop_unreadable_robots()
+    assert not received and not guard.pop_unreadable_robots()
     assert subscriptions[MESSAGE]("robot/65535/message", guard.seal(MESSAGE, b"hi"))
     assert subscriptions[MESSAGE]("robot/3/message", b"LE\xff") is False
-    assert len(heard) == 1 and guard.pop_unreadable_robots() == {3}
+    assert len(received) == 1 and guard.pop_unreadable_robots() == {3}

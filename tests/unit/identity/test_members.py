@@ -51,7 +51,7 @@ def test_no_text_does_harm(text: str) -> None:
         ("63" * 32, "63" * 31), ("63" * 32, "zz" * 32), ("63" * 32, "62" * 32), ("fleet", "group"),
     ],
 )  # fmt: skip
-def test_what_is_no_list_is_told_in_one_line(right: str, wrong: str) -> None:
+def test_a_malformed_list_gives_one_line(right: str, wrong: str) -> None:
     assert right in LIST.text
     with pytest.raises(MembersError, match="members: ") as raised:
         parse_members(LIST.text.replace(right, wrong))

@@ -23,7 +23,7 @@ def test_a_key_is_looked_at_so_often_and_no_more(topic: Topic, gaps_s: list[floa
     assert admission.refused == len(gaps_s) - admitted
 
 
-def test_each_speaks_for_itself_whoever_floods() -> None:
+def test_a_flood_leaves_other_keys_their_budget() -> None:
     admission, heard = Admission(most_keys=100), 0
     for tick in range(600):
         now_s = tick * 0.1
@@ -34,7 +34,7 @@ def test_each_speaks_for_itself_whoever_floods() -> None:
     assert heard == 600
 
 
-def test_who_comes_later_is_heard_once_the_flood_is_over() -> None:
+def test_a_new_key_is_admitted_after_a_flood() -> None:
     admission = Admission(most_keys=100)
     for each in range(1000):
         admission.admits(STATUS, f"robot/{each}/status", 2000, 0.0)

@@ -86,7 +86,7 @@ def test_this_version_stays_as_it_is_on_the_air() -> None:
 
 
 @given(st.floats(), st.floats(), st.floats())
-def test_every_number_can_be_said(x_m: float, y_m: float, other: float) -> None:
+def test_every_number_can_be_encoded(x_m: float, y_m: float, other: float) -> None:
     beacon = dataclasses.replace(BEACON, position_m=(x_m, y_m, 0.0), velocity_m_s=(0.0, 0.0, x_m))
     heard = decode_beacon(encode_beacon(beacon), 513)
     known = math.isfinite(x_m) and math.isfinite(y_m)

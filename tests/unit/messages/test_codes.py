@@ -42,7 +42,7 @@ def test_a_newer_robots_status_is_understood() -> None:
     assert heard.orders[0].refusal == Refusal(RefusalCode.OTHER, "what nobody knows yet")
 
 
-def test_whoever_says_too_much_is_understood_still() -> None:
+def test_too_long_texts_are_shortened() -> None:
     much = "x" * (MOST_LETTERS + 1)
     said = status(
         0,

@@ -73,7 +73,7 @@ def test_what_an_older_program_does_not_say_is_not_known_and_a_newer_ones_news_a
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e12])
-def test_what_is_no_sane_number_is_said_as_not_known(number: float) -> None:
+def test_a_number_that_is_not_finite_becomes_unknown(number: float) -> None:
     odd: dict[str, Any] = {
         "position_m": (1.0, number, 3.0), "velocity_m_s": (number, 0.0, 0.0),
         "global_deg": (number, number), "policy_velocity_m_s": (0.0, number),
@@ -124,7 +124,7 @@ def test_a_status_has_a_time_and_a_place_to_go_to(odd: dict[str, Any]) -> None:
     ],
     ids=lambda value: str(value)[:30],
 )  # fmt: skip
-def test_what_the_ground_says_is_bounded(key: str, value: object, said: str) -> None:
+def test_a_grounds_values_are_bounded(key: str, value: object, said: str) -> None:
     told = json.loads(encode(STATE))
     assert decode(GroundState, json.dumps(told).encode()) == STATE
     # Numbers of thousands of digits are for the encoder to write.
@@ -253,7 +253,7 @@ def test_what_is_no_message_is_refused(data: bytes) -> None:
             decode(kind, data)
 
 
-def test_hold_and_land_are_understood_whatever_else_a_state_says() -> None:
+def test_hold_and_land_are_decoded_whatever_else_a_state_has() -> None:
     told = json.loads(encode(STATE)) | {"world_id": 7, "fence": "none", "origin": []}
     data = json.dumps(told).encode()
     with pytest.raises(MessageError):

@@ -166,7 +166,7 @@ def test_a_mistake_is_one_line_that_names_it(
         assert name in message
 
 
-def test_the_loop_takes_what_the_file_says() -> None:
+def test_the_loop_has_the_configured_parameters() -> None:
     config = load_config(EXAMPLE)
     policy = replace(
         config.policy, env_scale=8.0, velocity_scale=0.5, max_message_age_s=0.5, max_input_age_s=1.5
@@ -193,7 +193,7 @@ HERE, THERE = ("tcp/127.0.0.1:7447",), ("tcp/10.0.0.1:7447",)
         (LinkConfig(type="other", listen=HERE), True),
     ],
 )
-def test_whether_somebody_on_another_computer_may_be_heard(link: LinkConfig, leaves: bool) -> None:
+def test_whether_messages_from_other_computers_may_arrive(link: LinkConfig, leaves: bool) -> None:
     assert link.leaves_machine is leaves
 
 

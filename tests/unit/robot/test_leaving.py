@@ -30,7 +30,7 @@ def program_of(take_up: Callable[..., None] | None = None, **steps: Any) -> _Pro
     return _Program(config, node, rest, rest, recorder, rest, take_up)
 
 
-def test_what_cannot_be_kept_is_told_for_as_long_and_logged_once() -> None:
+def test_an_unwritable_identity_is_an_alarm_and_logged_once() -> None:
     problems: list[OSError | None] = [OSError(28, "No space left on device", "start")]
 
     def take_up(**_: bool) -> None:

@@ -124,7 +124,7 @@ def test_own_repeated_and_overtaken_messages_are_dropped() -> None:
     assert sequences(table.swap(0.0)) == [(1, 4)]
 
 
-def test_a_restarted_robot_is_heard_at_once() -> None:
+def test_a_restarted_robot_is_accepted_at_once() -> None:
     table = NeighbourTable(OWN_ID)
     receive(table, message(1, 900, start=10))
     assert receive(table, message(1, 0, start=11)) is None
@@ -132,7 +132,7 @@ def test_a_restarted_robot_is_heard_at_once() -> None:
     assert sequences(table.swap(0.0)) == [(1, 0)]
 
 
-def test_a_smaller_start_is_heard_once_its_robot_was_silent() -> None:
+def test_a_smaller_start_is_accepted_after_a_silence() -> None:
     table = NeighbourTable(OWN_ID)
     receive(table, message(1, 900, start=10), now_s=0.0)
     # As late as a message of an earlier start can be.
@@ -189,7 +189,7 @@ def test_a_message_that_arrives_too_old_or_of_unknown_age_is_not_kept() -> None:
     assert table.swap(10.0) == ()
     # They are the newest beacons all the same.
     assert receive(table, message(1, 2), 10.0, age_s=0.1) is Rejection.OUTDATED
-    (heard,) = table.heard(10.0, 3.0)
+    (heard,) = table.beacons(10.0, 3.0)
     assert heard.beacon == message(1, 4).beacon
 
 
@@ -376,7 +376,7 @@ class AgainstHistory(RuleBasedStateMachine):
     @invariant()
     def beacons_are_the_newest(self) -> None:
         assert [
-            (heard.beacon, heard.received_at_s) for heard in self.table.heard(self.now_s, 3.0)
+            (heard.beacon, heard.received_at_s) for heard in self.table.beacons(self.now_s, 3.0)
         ] == [
             (sent.beacon, at_s)
             for _, (sent, at_s) in sorted(self.heard.items())
@@ -393,18 +393,18 @@ def test_a_number_far_ahead_silences_a_robot_for_five_seconds_only() -> None:
     receive(table, message(1, 2**32 - 1), now_s=0.0)
     for sequence in range(16):
         receive(table, message(1, sequence), now_s=sequence / 2.5)
-    beacons = [heard.beacon for heard in table.heard(6.0, 1.0)]
+    beacons = [heard.beacon for heard in table.beacons(6.0, 1.0)]
     assert beacons == [message(1, 15).beacon]
 
 
 def test_a_message_in_this_robots_own_name_is_noticed() -> None:
     table = NeighbourTable(OWN_ID)
-    assert not table.is_own_id_heard(0.0)
+    assert not table.is_own_id_received(0.0)
     assert receive(table, message(OWN_ID, 1), now_s=10.0) is Rejection.OWN
-    assert table.is_own_id_heard(13.0) and not table.is_own_id_heard(13.1)
+    assert table.is_own_id_received(13.0) and not table.is_own_id_received(13.1)
 
 
-def test_a_start_with_an_earlier_clock_is_heard_after_a_beacon_alone() -> None:
+def test_a_start_with_an_earlier_clock_is_accepted_after_a_beacon_alone() -> None:
     table = NeighbourTable(OWN_ID)
     assert receive(table, message(1, 9, start=3)) is None
     alone = message(1, 1, start=2)
@@ -450,7 +450,7 @@ def test_eight_link_threads_lose_nothing_and_turn_nothing_back(max_message_age_s
             seen.append(
                 [
                     (beacon.robot_id, beacon.position_m[1])
-                    for heard in table.heard(0.1, 1.0)
+                    for heard in table.beacons(0.1, 1.0)
                     if (beacon := heard.beacon).position_m
                 ]
             )

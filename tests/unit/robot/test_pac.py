@@ -452,7 +452,7 @@ class LeftHalf:
         return Look(self.importance, self.seen)
 
 
-def test_a_camera_is_told_its_height_and_what_it_did_not_see_stays_unseen(
+def test_a_camera_gets_its_height_and_unseen_cells_stay_unseen(
     shipped_bundle: Bundle,
 ) -> None:
     manifest = dataclasses.replace(shipped_bundle.manifest, family="watching", parameters={})
@@ -513,7 +513,7 @@ def test_messages_of_another_mission_frame_are_not_listened_to(shipped_policy: L
     assert robot.receive(*message(shipped_policy, frame_id=8, sequence=2), 0.0) is None
 
 
-def test_what_others_have_seen_is_heard_within_one_mission(sharing_bundle: Bundle) -> None:
+def test_others_maps_are_merged_within_one_mission(sharing_bundle: Bundle) -> None:
     """Whoever begins the next one later still tells of the last, and is not heard."""
     policy = LpacPolicy(sharing_bundle)
     here, there = World(position=(16.0, 16.0, 3.0)), World(position=(12.0, 16.0, 3.0))
