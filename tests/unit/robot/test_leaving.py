@@ -13,7 +13,7 @@ def nothing(*_: Any) -> None:
     pass
 
 
-def program_of(take_up: Callable[..., None] | None = None, **steps: Any) -> _Program:
+def program_of(update_identity: Callable[..., None] | None = None, **steps: Any) -> _Program:
     """Make a program whose node does nothing in steps other than these."""
     names = ("control", "perception", "policy", "preflight", "status")
     node: Any = SimpleNamespace(
@@ -27,17 +27,17 @@ def program_of(take_up: Callable[..., None] | None = None, **steps: Any) -> _Pro
     )
     recorder: Any = SimpleNamespace(flush=nothing)
     rest: Any = SimpleNamespace()
-    return _Program(config, node, rest, rest, recorder, rest, take_up)
+    return _Program(config, node, rest, rest, recorder, rest, update_identity)
 
 
 def test_an_unwritable_identity_is_an_alarm_and_logged_once() -> None:
     problems: list[OSError | None] = [OSError(28, "No space left on device", "start")]
 
-    def take_up(**_: bool) -> None:
+    def update_identity(**_: bool) -> None:
         if problems[-1] is not None:
             raise problems[-1]
 
-    program = program_of(take_up)
+    program = program_of(update_identity)
     with lines_said() as lines:
         program._write_step()
         program._write_step()
