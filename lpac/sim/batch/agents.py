@@ -1,4 +1,4 @@
-"""Many robots under one policy: what `edge.policy.family.Agent` is, for batches."""
+"""Batched counterpart of `edge.policy.family.Agent`: many robots under one policy."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,16 +16,16 @@ from edge.policy.family import Observation, perceived_problem, step_problem
 from edge.policy.lpac.images import PolicyImages
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 
-# The most robots in one batch of the CNN: more are no faster, and take more memory.
+# Largest batch of the CNN: larger ones are no faster, and take more memory.
 _CNN_BATCH = 8
 
 Inputs = Mapping[str, F32]
 
 
 class PolicyFailedError(ArithmeticError):
-    """A policy raised an error, or computed what robots refuse.
+    """A policy raised an error, or its output is one that robots refuse.
 
-    The exact simulator shows what they do then.
+    `lpac.sim.points.fly_points` shows how they react.
     """
 
 
@@ -42,8 +42,8 @@ class PolicySteps(NamedTuple):
 class Agents(Protocol):
     """Robots 0..N-1, of one world or of several, under one policy.
 
-    What an agent sees has no effect on what it does later, but by its features: so the simulator
-    asks for the inputs, and the features, of those observations only by which a robot decides.
+    An observation affects later steps by its features alone. So the simulator computes inputs and
+    features only of the observations on which a robot decides.
     """
 
     @property
@@ -54,7 +54,7 @@ class Agents(Protocol):
         """The policy's inputs from an observation, by name: new arrays, the same for all robots."""
 
     def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
-        """Features of n robots from their inputs. The only one that any thread may call."""
+        """Features of n robots from their inputs. The only thread-safe method."""
 
     def step(
         self,
@@ -63,17 +63,17 @@ class Agents(Protocol):
         payloads: Sequence[Sequence[F32]],
         degrees: Sequence[int],
     ) -> PolicySteps:
-        """`Agent.step` of n robots, no one twice; payloads are float32, rounded as on the wire."""
+        """`Agent.step` of n distinct robots; payloads are float32, rounded as on the wire."""
 
     def reset(self, robot: int) -> None:
-        """The robot's program starts anew: it forgets all."""
+        """Forget everything, as a restarted program."""
 
 
 class LpacAgents:
-    """Robots under a policy of the paper's family; all that they remember is in the messages."""
+    """Robots under a policy of the paper's family; their only memory is in the messages."""
 
     def __init__(self, policy: LpacPolicy, perceptions: Sequence[PerceptionParameters]) -> None:
-        """`perceptions` are of each robot: the sizes of its world and of what it perceives."""
+        """`perceptions` has the perception parameters of each robot."""
         self._policy = policy
         self._perceptions = perceptions
         images = policy.lpac.images
@@ -121,7 +121,7 @@ class LpacAgents:
         return PolicySteps(velocities, np.stack(said))
 
     def reset(self, robot: int) -> None:
-        """There is nothing to forget."""
+        """Do nothing: the agents have no memory."""
 
 
 class SingleAgents:
@@ -143,7 +143,7 @@ class SingleAgents:
         return self._policies[0].message_size
 
     def inputs(self, robot: int, observation: Observation) -> Inputs:
-        """The agent's record of its inputs, and the features that it computed."""
+        """The agent's recorded inputs and its features."""
         try:
             perceived = self._agents[robot].observe(observation)
         except Exception as error:
@@ -184,7 +184,7 @@ def _failed(problem: str) -> PolicyFailedError:
 
 
 def make_agents(bundle: Bundle, perceptions: Sequence[PerceptionParameters]) -> Agents:
-    """The fastest agents that there are for the bundle's family, one for each of `perceptions`.
+    """The fastest agents available for the bundle's family, one for each of `perceptions`.
 
     Raises BundleError and ConfigError as `load_policy`.
     """

@@ -1,8 +1,8 @@
 """Simulated flights over many worlds at once.
 
-Each world runs on until one of its robots needs a velocity that is not computed yet. When all
-worlds wait, what has gathered is computed in batches. The order in which robots, messages and
-vehicles act is that of `lpac.sim.points.fly`, and so is what comes out, for the same seed.
+Each world runs until one of its robots needs a velocity that is not computed yet. When all worlds
+wait, the pending policy steps are computed in batches. The order of events is that of
+`lpac.sim.points.fly_points`, and the results are the same for the same seed.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,8 +28,8 @@ from lpac.sim.swarm import Swarm
 class PolicyInputs(NamedTuple):
     """Inputs of a world's robots: arrays (n, ...) by name, of the n robots of `robots`.
 
-    It is what each perceived last, which was up to a perception period ago. Robots that failed, or
-    have perceived nothing for longer than `max_input_age_s`, are left out.
+    They are of each robot's last perception, up to one perception period ago. Robots that failed,
+    or whose perception is older than `max_input_age_s`, are left out.
     """
 
     robots: tuple[int, ...]
@@ -44,7 +44,7 @@ class BatchMoment(WorldMoment):
         self._swarm = swarm
 
     def inputs(self) -> PolicyInputs:
-        """See `PolicyInputs`. Nothing that the robots do later depends on it."""
+        """See `PolicyInputs`. Reading them does not affect the flight."""
         alive = self.alive
         found = {
             i: inputs
@@ -73,9 +73,7 @@ class BatchedFlights:
         """
         for scenario in scenarios:
             if scenario.controller != "lpac":
-                raise ValueError(
-                    f"controller = {scenario.controller!r}: in batches only the bundle flies"
-                )
+                raise ValueError(f"controller = {scenario.controller!r}: must be 'lpac' in batches")
         self.prepared = tuple(prepare(scenario, bundle) for scenario in scenarios)
         perceptions = [
             world.perception for world in self.prepared for _ in range(world.scenario.robots)
@@ -88,7 +86,7 @@ class BatchedFlights:
         )
 
     def advance(self, until_s: Sequence[float]) -> None:
-        """Move each world on to its time. Raises PolicyFailedError."""
+        """Advance each world to its time. Raises PolicyFailedError."""
         running = [
             swarm.advance(time_s) for swarm, time_s in zip(self.swarms, until_s, strict=True)
         ]
@@ -107,7 +105,7 @@ class BatchedFlights:
             )
 
     def finish(self) -> None:
-        """Compute what no robot has needed yet, so that `largest_payload` is complete."""
+        """Compute the pending steps, so that `largest_payload` is complete."""
         self._deferred.compute()
 
     def _swarm(self, world: Preparation, first_agent: int) -> Swarm[BatchedRobot]:
@@ -127,7 +125,7 @@ class BatchedFlights:
     ) -> BatchedRobot:
         agent = first_agent + robot
         if start > 1:
-            # What its agent has still to decide, it decides as the one that it was.
+            # Steps pending from before the restart need the agent's old memory.
             self._deferred.compute()
             self._deferred.agents.reset(agent)
         return BatchedRobot(
@@ -143,10 +141,11 @@ class BatchedFlights:
 
 
 def fly_batch(scenarios: Sequence[Scenario], bundle: Bundle) -> list[FlightRecord]:
-    """Simulate `scenarios`, all with `bundle`: what `lpac.sim.points.fly` does one by one.
+    """Simulate `scenarios`, all with `bundle`: the batched equivalent of
+    `lpac.sim.points.fly_points`.
 
-    Raises BundleError and ConfigError for a bundle that cannot fly, ValueError for impossible
-    scenarios and for baselines, PolicyFailedError for a policy that computes what robots refuse.
+    Raises BundleError and ConfigError for a bundle that cannot fly, ValueError for invalid
+    scenarios and for baselines, PolicyFailedError for policy outputs that robots refuse.
     """
     flights = BatchedFlights(scenarios, bundle)
     times_s = [world.times_s for world in flights.prepared]

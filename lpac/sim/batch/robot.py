@@ -1,8 +1,8 @@
 """One robot's steps, as `edge.robot.pac.Pac` has them, without its policy's computations.
 
-What a tick of the policy takes from the swarm (positions, who is heard) is known at once; what it
-computes, a velocity and a payload, is not needed before the robot's next control tick. So a tick
-leaves a `DeferredStep` to be computed later, together with others' (`DeferredSteps`).
+The inputs of a policy tick (positions, received messages) are known at once; its outputs, a
+velocity and a payload, are not needed before the robot's next control tick. So a tick leaves a
+`DeferredStep`, which `DeferredSteps` computes later in a batch.
 """
 
 from collections import defaultdict
@@ -29,7 +29,7 @@ from lpac.sim.batch.seen import SeenMap, ShownWorld
 
 
 def _age_error_s() -> float:
-    """How much older a message may be than it seems, where all have one clock."""
+    """Error of a message's age where all robots share one clock, s."""
     clock = FleetClock()
     clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     now = clock.at(0.0)
@@ -43,7 +43,7 @@ _AGE_ERROR_S = _age_error_s()
 
 @dataclass(slots=True, eq=False)
 class DeferredFeatures:
-    """An agent's inputs from one perception, and its features, once they are computed."""
+    """An agent's inputs from one perception; `values` are its features, once computed."""
 
     agent: int
     inputs: Inputs
@@ -52,12 +52,12 @@ class DeferredFeatures:
 
 @dataclass(slots=True, eq=False)
 class DeferredStep:
-    """A tick of a robot's policy: what it takes, and what it computes, once it is computed.
+    """A tick of a robot's policy: its inputs, and its outputs once computed.
 
-    Ticks between two perceptions take the same `features`. `heeded` are the ticks from which its
-    neighbours' messages are. `rank` is how many others have to be computed first, one after
-    another. `velocity` (2,) is None as long as it is not computed, and `payload` (message_size,),
-    the numbers that the neighbours receive, undefined; `largest` is the largest of these.
+    Ticks between two perceptions share `features`. `heeded` are the neighbours' ticks whose
+    payloads it uses. `rank` is the length of the longest chain of steps to compute before it.
+    Before it is computed, `velocity` (2,) is None and `payload` (message_size,), as neighbours
+    receive it, is undefined; `largest` is the payload's largest absolute value.
     """
 
     robot: "BatchedRobot"
@@ -71,7 +71,7 @@ class DeferredStep:
 
 
 class DeferredSteps:
-    """The steps, of all robots of `agents`, that are not computed yet."""
+    """Pending steps of all robots of `agents`."""
 
     def __init__(self, agents: Agents, payload_limit: float | None) -> None:
         """`payload_limit` is that of the bundle's manifest."""
@@ -81,15 +81,15 @@ class DeferredSteps:
         self._features: list[DeferredFeatures] = []
 
     def add_features(self, features: DeferredFeatures) -> None:
-        """Compute them later, before the first step that takes them."""
+        """Add features, to be computed before the steps that use them."""
         self._features.append(features)
 
     def add(self, step: DeferredStep) -> None:
-        """Compute it later."""
+        """Add a pending step."""
         self._steps.append(step)
 
     def compute(self) -> None:
-        """Compute them all. Raises PolicyFailedError."""
+        """Compute all pending features and steps. Raises PolicyFailedError."""
         steps, self._steps = self._steps, []
         features, self._features = self._features, []
         if features:
@@ -102,7 +102,7 @@ class DeferredSteps:
         for _, group in sorted(ranked.items()):
             self._step(group)
         for step in steps:
-            # What it was computed from would hold on to all that was before.
+            # Drop references, which would keep all earlier steps alive.
             step.heeded = ()
 
     def _step(self, steps: list[DeferredStep]) -> None:
@@ -120,7 +120,7 @@ class DeferredSteps:
         if not (np.isfinite(velocities).all() and (largest <= self._payload_limit).all()):
             raise PolicyFailedError(
                 "a velocity or a payload of the policy is not finite, or beyond the bundle's "
-                "payload_limit: `lpac.sim.points.fly` shows what robots do then"
+                "payload_limit: fly without batches to see how the robots react"
             )
         for i, step in enumerate(steps):
             step.velocity = velocities[i]
@@ -141,9 +141,9 @@ class _Message(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """When the robot looked, from where (2,), where those in range were (n, 2), what it tells.
+    """One perception: time, position (2,), positions of neighbours (n, 2), velocity, shared map.
 
-    `velocity` (2,) is its own, in model units/s.
+    `velocity` (2,) is the robot's own, model units/s.
     """
 
     time_s: float
@@ -168,9 +168,9 @@ class BatchedRobot:
         parameters: PacParameters,
         local_map: F32,
     ) -> None:
-        """`agent` is its number among those of `deferred`, which computes its policy.
+        """`agent` is its index among the agents of `deferred`.
 
-        `local_map` (local_map_size, local_map_size) is room that robots may share.
+        `local_map` (local_map_size, local_map_size) is a buffer that robots may share.
         """
         self.agent = agent
         self._robot_id = robot_id
@@ -183,7 +183,7 @@ class BatchedRobot:
         self._local_map = local_map
         self._swap_clears = parameters.max_message_age_s == 0.0
         self._look: _Look | None = None
-        # Of that, once its policy has taken them.
+        # Features of the last look, once its policy has used them.
         self._features: DeferredFeatures | None = None
         self._action: DeferredStep | None = None
         self._action_s = 0.0
@@ -195,7 +195,7 @@ class BatchedRobot:
 
     @property
     def waits(self) -> bool:
-        """Whether its policy's last step is not computed yet."""
+        """Whether its policy's last step is still pending."""
         return self._action is not None and self._action.velocity is None
 
     @property
@@ -204,7 +204,7 @@ class BatchedRobot:
         return self._parameters.payload
 
     def perceive(self, now_s: float) -> None:
-        """See, and remember who is there."""
+        """Observe the world and the neighbours."""
         odometry, own = self._own()
         self._seen.observe(own)
         neighbours = self.table.neighbours(now_s)
@@ -224,10 +224,7 @@ class BatchedRobot:
         return None if look is None else self._inputs(look)
 
     def say(self, now_s: float) -> _Message | None:
-        """Leave a step of the policy to be computed, and say the message that it leads to.
-
-        None when there is nothing to send: nothing perceived that is fresh.
-        """
+        """Add a pending policy step, and return its message; None without a fresh perception."""
         look = self._fresh_look(now_s)
         if look is None:
             return None
@@ -235,7 +232,7 @@ class BatchedRobot:
             self._features = DeferredFeatures(self.agent, self._inputs(look))
             self._deferred.add_features(self._features)
         odometry, own = self._own()
-        # Where the swap takes nothing away, the neighbours are those whose messages it hands out.
+        # Read the neighbours before a swap that clears the table.
         heard = self.table.neighbours(now_s) if self._swap_clears else ()
         received = self.table.swap(now_s)
         near = self._in_range(own, [each.beacon for each in received])
@@ -284,13 +281,13 @@ class BatchedRobot:
         return self._flown[1]
 
     def hear(self, message: _Message, now_s: float) -> None:
-        """Take in a neighbour's message."""
+        """Receive a neighbour's message."""
         sent = message.beacon.sent
         assert sent is not None
         self.table.receive(*message, now_s, now_s - sent.time_s + _AGE_ERROR_S)
 
     def note_payloads(self, heeded: tuple[DeferredStep, ...]) -> None:
-        """Those whose payloads its policy took."""
+        """Record the largest payload that its policy used."""
         self.largest_payload = max((self.largest_payload, *(each.largest for each in heeded)))
 
     def _fresh_look(self, now_s: float) -> _Look | None:

@@ -1,4 +1,4 @@
-"""Map of a robot in a known world: which of its cells it has seen, and nothing else."""
+"""Map of a robot in a known world: only which cells it has seen."""
 
 import numpy as np
 
@@ -6,19 +6,19 @@ from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters, part_in_world, window_corner
 from edge.core.shared_map import Codes, SharedCells, SharedMap, cell_means, codes_of
 
-# The box grows by so many cells beyond what it has to hold, so that it seldom grows.
+# Margin by which the box grows beyond need, in cells, so that it seldom grows.
 _MARGIN = 64
 
 
 class ShownWorld:
-    """World that sensors show, and that robots that share maps tell of."""
+    """The true world, with its shared-map codes if robots share maps."""
 
     def __init__(self, importance: F32, parameters: PerceptionParameters) -> None:
-        """`importance` (world_size, world_size) is the world, which is not copied."""
+        """`importance` (world_size, world_size) is not copied."""
         self.importance = importance
         self.parameters = parameters
         cell = parameters.shared_map_cell
-        # Of all cells that maps are shared in.
+        # Codes of all shared-map cells.
         self.codes: Codes = np.zeros((0, 0), np.uint8)
         if cell:
             beyond = -parameters.world_size % cell
@@ -26,11 +26,11 @@ class ShownWorld:
 
 
 class SeenMap:
-    """Map of one robot, from its sensor's views of the world and what others tell.
+    """Map of one robot, from its sensor and from shared maps.
 
-    It is what `edge.core.memory.RobotMemory` is: where the robot has seen, the world's importance,
-    elsewhere what stands for the unseen. The world is all robots' own; what a robot has of its own
-    is one byte for each cell of a box around what it has seen, and one for each shared cell.
+    Equivalent to `edge.core.memory.RobotMemory`: the world's importance in seen cells, and the
+    value for unseen ones elsewhere. All robots share the world; each one stores one byte for each
+    cell of a box around the seen cells, and one for each shared cell.
     """
 
     def __init__(self, world: ShownWorld) -> None:
@@ -58,7 +58,7 @@ class SeenMap:
         self._seen[x.start - x0 : x.stop - x0, y.start - y0 : y.stop - y0] = True
 
     def hear(self, told: SharedMap) -> None:
-        """Remember what another robot knows; nothing, if maps are not shared."""
+        """Merge another robot's shared map; do nothing if maps are not shared."""
         if self._cells:
             self._cells.hear(told)
 
@@ -69,8 +69,8 @@ class SeenMap:
     def local_map(self, position: F64, out: F32) -> F32:
         """Fill `out` (local_map_size, local_map_size) around `position` (2,) and return it.
 
-        `PerceptionParameters.unseen` where nothing was seen, nor told by others; the outside of the
-        world is 0.
+        Cells neither seen nor shared are `PerceptionParameters.unseen`; those outside the world
+        are 0.
         """
         parameters = self._parameters
         size = parameters.local_map_size
@@ -97,7 +97,7 @@ class SeenMap:
         return out
 
     def _grow(self, x: slice, y: slice) -> None:
-        """Make the box hold the cells of `x` and `y`, too."""
+        """Extend the box to include the cells of `x` and `y`."""
         (x0, y0), (x1, y1) = self._low, self._high
         seen = self._seen
         if not seen.size:
