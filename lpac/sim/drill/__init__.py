@@ -1,1 +1,1 @@
-"""Faults done to a fleet in flight, and what is promised then, judged by the vehicles' truth."""
+"""Faults injected into a fleet in flight, and promises judged by the vehicles' true state."""

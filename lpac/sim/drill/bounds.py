@@ -1,6 +1,6 @@
 """Bounds of the drill: figures of a flight's record, with limits stated before the flight.
 
-`always` gives the bounds of every flight, whatever the fault. Everything here is pure.
+`always` gives the bounds that hold for every fault. All functions are pure.
 """
 
 import math
@@ -24,23 +24,22 @@ RobotGroup = Literal["hit", "next", "others", "all", "first half", "second half"
 _BUDGET = ErrorBudget()
 # The greatest error of a simulated receiver, drift in wind, and half a drone.
 POSITION_ERROR_M = GREATEST_BIAS_M + _BUDGET.wind_m + _BUDGET.drone_m / 2.0
-# A mode is told once a second, and a tick later it is obeyed.
+# PX4 sends its mode once a second; the robot reacts a tick later.
 PILOT_NOTICED_S = 1.1
-# The operator wants the vehicle's mode ended, which PX4 tells late.
+# After rejoin, until PX4 reports that the pilot's mode has ended.
 _REJOIN_S = 4.0
 # A vehicle that holds its position in gusts of 8 m/s stays below this.
 AT_REST_M_S = 0.5
-# A robot lands this far beside another one, by both robots' estimates, which may differ by 6 m.
+# Landing distance to another robot, by both robots' estimates, which may differ by 6 m.
 _BESIDE_M, _ESTIMATES_ERR_M = 8.0, 6.0
 _NEAR_M = _BESIDE_M + _ESTIMATES_ERR_M
 _STEP_S = 0.06
-# An order may start a motor this long after its answer.
+# Motors may start this long after the answer to a command.
 _ARMED_AFTER_S = 1.0
-# A fall from here does no harm.
+# A fall from this height does no harm.
 FALLS_M = 0.5
 # PX4 descends at 1.5 m/s, and slower near its estimate of the ground.
 TOUCHDOWN_M_S = 2.0
-
 # A lower vehicle stands on the ground.
 ON_GROUND_BELOW_M = 0.1
 
@@ -103,7 +102,7 @@ class Part(NamedTuple):
 
     @property
     def lands(self) -> Bools:
-        """(T,): whether the vehicle lands, or is disarmed."""
+        """(T,): whether the vehicle is landing or disarmed."""
         return self.track.is_in(*LANDING) | ~self.track.armed
 
     @property
@@ -140,7 +139,8 @@ class Bound(ABC):
     """A bound on a group of vehicles, in a time window from the fault, or from the mark `after`.
 
     The figure is the worst vehicle's value: the greatest (`worst` is max) must be at most the
-    limit, the least (min) at least; counts are added (sum). `start` is the figure of no vehicle.
+    limit, the least (min) at least; counts are summed (sum). `start` is the figure without any
+    vehicle.
     """
 
     name: ClassVar[str]
@@ -161,7 +161,7 @@ class Bound(ABC):
         cls.start = {max: 0.0, min: math.inf, sum: 0}[worst] if start is None else start
 
     def figure(self, flight: FlightRecord) -> Figure:
-        """Measure the worst of the vehicles."""
+        """Measure the worst vehicle."""
         cls, fault = type(self), flight.fault
         since_s = fault.marks[self.after] if self.after else fault.begin_s
         values = [cls.start]
@@ -177,7 +177,7 @@ class Bound(ABC):
         return self.name
 
     def limit_in(self, flight: FlightRecord) -> float:
-        """Limit, which may depend on the fleet."""
+        """The limit in this flight; it may depend on the fleet."""
         return self.limit
 
     @abstractmethod
@@ -224,11 +224,11 @@ class InsideFence(Always, name="true fence margin", unit="m", worst=min):
 
 
 class CarriedBeyond(InsideFence, name="true fence margin of who is carried", unit="m", worst=min):
-    """The fault itself carries vehicles beyond the fence, by no more than that."""
+    """The fault itself carries vehicles no further beyond the fence."""
 
 
 class BelowCeiling(Always, name="greatest height", unit="m"):
-    """Only a pilot flies higher above the fence's ceiling."""
+    """Only a pilot flies higher than this above the fence's ceiling."""
 
     def limit_in(self, flight: FlightRecord) -> float:
         return _fence(flight).ceiling_m + self.limit
@@ -238,7 +238,7 @@ class BelowCeiling(Always, name="greatest height", unit="m"):
 
 
 class NoUnorderedStart(Always, name="motors started without an order", worst=sum):
-    """Motors start only on a fresh takeoff order to that robot, and once on each order."""
+    """Motors start only on a fresh takeoff command to that robot, once for each command."""
 
     def measure(self, part: Part) -> float:
         orders = part.flight.fault.ordered("takeoff", part.robot)
@@ -274,7 +274,7 @@ class ComesDownGently(Always, name="touches the ground at", unit="m/s"):
 
 
 class PilotIsAlone(Always, name="last setpoint to a pilot's vehicle", unit="s"):
-    """A piloted vehicle gets no setpoints, once the program can know of the pilot."""
+    """A piloted vehicle gets no setpoints once the program can know of the pilot."""
 
     def measure(self, part: Part) -> float:
         latest_s, track = 0.0, part.track
@@ -282,7 +282,7 @@ class PilotIsAlone(Always, name="last setpoint to a pilot's vehicle", unit="s"):
             sent_s = np.unique(track.between(begin_s, end_s).setpoint_at_s)
             sent_s = sent_s[(sent_s > begin_s) & (sent_s <= end_s)]
             for order in part.flight.fault.ordered("rejoin", part.robot):
-                # The vehicle's clock is a step behind the order.
+                # The vehicle's clock is a step behind the command.
                 sent_s = sent_s[
                     (sent_s < order.began_s - _STEP_S) | (sent_s > order.began_s + _REJOIN_S)
                 ]
@@ -292,7 +292,7 @@ class PilotIsAlone(Always, name="last setpoint to a pilot's vehicle", unit="s"):
 
 
 class AllDown(Always, name="not down in the end", worst=sum):
-    """All stand on the ground at the end, motors off."""
+    """All vehicles stand on the ground at the end, motors off."""
 
     def measure(self, part: Part) -> float:
         return bool(part.track.armed[-1] or _above(part.track)[-1])
@@ -331,14 +331,14 @@ def always(beyond_fence_m: float, carried: RobotGroup) -> tuple[Criterion, ...]:
 
 
 class Lands(Bound, name="lands", unit="s"):
-    """The vehicle begins to land, by order or by itself, in time."""
+    """The vehicle begins to land in time, on command or on its own."""
 
     def measure(self, part: Part) -> float:
         return part.first_s(part.lands)
 
 
 class NotLandedBefore(Bound, name="lands no sooner", unit="s", worst=min):
-    """The vehicle lands no sooner."""
+    """The vehicle does not land before the limit."""
 
     def measure(self, part: Part) -> float:
         return part.first_s(part.lands)
@@ -358,7 +358,7 @@ class Down(Bound, name="down", unit="s"):
 class Stands(Bound, name="speed at rest", unit="m/s"):
     """The vehicle holds its position, by its own estimate, which may wander.
 
-    With `may_part` it may move away from a vehicle nearby.
+    With `may_part` it may move away from a nearby vehicle.
     """
 
     limit: float = AT_REST_M_S
@@ -374,7 +374,7 @@ class Stands(Bound, name="speed at rest", unit="m/s"):
 
 
 class StaysNear(Bound, name="from where it held", unit="m"):
-    """The vehicle stays near its place at the begin of the window, in the plane."""
+    """The vehicle stays near its position at the start of the window, in the plane."""
 
     def measure(self, part: Part) -> float:
         return _farthest_m(part.track.position_m)
@@ -390,7 +390,7 @@ class StraightDown(Bound, name="drift while it lands", unit="m"):
 
 @dataclass(frozen=True)
 class LandApart(Always, name="landed apart", unit="m", worst=min):
-    """Vehicles that land avoid each other."""
+    """Landing vehicles avoid each other."""
 
     limit: float = _BESIDE_M - _ESTIMATES_ERR_M
 
@@ -406,7 +406,7 @@ class LandApart(Always, name="landed apart", unit="m", worst=min):
 
 
 class LandsAtPad(Bound, name="from its pad", unit="m"):
-    """The vehicle lands near its own pad, or beside, where a stray vehicle lies near the pad."""
+    """The vehicle lands near its own pad, or further off if a stray vehicle lies near it."""
 
     def measure(self, part: Part) -> float:
         pads_m = part.flight.fault.pads_m
@@ -421,7 +421,7 @@ class LandsAtPad(Bound, name="from its pad", unit="m"):
 
 
 class FliesOn(Bound, name="share of the mission", worst=min, start=1.0):
-    """The vehicle flies its mission for at least that share of the window."""
+    """The vehicle flies its mission for at least this share of the window."""
 
     def measure(self, part: Part) -> float:
         flown = part.flies_offboard & part.track.is_velocity & _above(part.track)
@@ -429,7 +429,7 @@ class FliesOn(Bound, name="share of the mission", worst=min, start=1.0):
 
 
 class ComesBack(Bound, name="flown beyond the fence", unit="s"):
-    """The vehicle is back inside in time, but for position errors, or PX4 holds or lands it."""
+    """The vehicle is back inside in time, up to position errors, or PX4 holds or lands it."""
 
     def measure(self, part: Part) -> float:
         edges, track, latest_s = _fence(part.flight).edges(), part.track, 0.0
@@ -441,7 +441,7 @@ class ComesBack(Bound, name="flown beyond the fence", unit="s"):
 
 
 class Moves(Bound, name="flies at least", unit="m", worst=min):
-    """The vehicle flies at least so far, in the plane."""
+    """The vehicle flies at least this distance, in the plane."""
 
     def measure(self, part: Part) -> float:
         return float(np.hypot(*np.diff(part.track.position_m[:, :2], axis=0).T).sum())
@@ -456,7 +456,7 @@ class Holds(Bound, name="PX4 holds", unit="s"):
 
 @dataclass(frozen=True)
 class KeepsAway(Always, name="keeps away", unit="m", worst=min):
-    """The next vehicle keeps that far away from the hit one, in the air."""
+    """The next vehicle keeps at least this distance from the hit one, in the air."""
 
     robots: RobotGroup = "hit"
 
@@ -474,7 +474,7 @@ class MissionEnds(Bound, name="last of the mission", unit="s"):
 
 @dataclass(frozen=True, kw_only=True)
 class LeavesMission(Bound, name="leaves the mission", unit="s", start=-math.inf):
-    """The last velocity setpoint comes in time after the vehicle sank by `below_m`."""
+    """The last velocity setpoint comes in time once the vehicle has sunk by `below_m`."""
 
     below_m: float
 
@@ -525,7 +525,7 @@ class MotorsOff(Bound, name="motors off", unit="s"):
 
 
 class KeepsHeight(Bound, name="leaves its height", unit="m"):
-    """In offboard flight the vehicle keeps its height of the fault's begin."""
+    """In offboard flight the vehicle keeps its height at the start of the window."""
 
     def measure(self, part: Part) -> float:
         heights_m = part.heights_m[part.flies_offboard]
@@ -533,7 +533,7 @@ class KeepsHeight(Bound, name="leaves its height", unit="m"):
 
 
 class Climbs(Bound, name="climbs again", unit="m"):
-    """The vehicle never climbs by more than that above its lowest height."""
+    """The vehicle never climbs by more than this above its lowest height."""
 
     def measure(self, part: Part) -> float:
         climbed_m = part.heights_m - np.minimum.accumulate(part.heights_m)
@@ -541,7 +541,7 @@ class Climbs(Bound, name="climbs again", unit="m"):
 
 
 class NotFaster(Bound, name="greatest speed", unit="m/s"):
-    """In offboard flight the vehicle stays below that speed, in the plane."""
+    """In offboard flight the vehicle stays below this speed, in the plane."""
 
     def measure(self, part: Part) -> float:
         flown_m_s = part.track.velocity_m_s[part.flies_offboard & _above(part.track), :2]
@@ -576,7 +576,7 @@ def _farthest_m(places_m: F64) -> float:
 
 
 def _spans_s(vehicle: TrueTrack, holds: Bools) -> list[tuple[float, float]]:
-    """Begins and ends of the spans in which the condition holds."""
+    """Start and end times of the spans in which the condition holds."""
     steps = np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8))
     begins, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1
     times_s = vehicle.time_s
@@ -584,7 +584,7 @@ def _spans_s(vehicle: TrueTrack, holds: Bools) -> list[tuple[float, float]]:
 
 
 def _alone_m(part: Part) -> F64:
-    """(T,): distance of the nearest other vehicle, in the plane."""
+    """(T,): distance to the nearest other vehicle, in the plane."""
     times_s, own_m = part.track.time_s, part.track.position_m[:, :2]
     away_m = [np.full(len(times_s), np.inf)]
     for robot, other in enumerate(part.flight.vehicles):

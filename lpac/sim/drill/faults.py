@@ -1,7 +1,7 @@
 """Faults of the drill, each with the promise of docs/faults.md and the bounds that follow from it.
 
-Bounds are stated before anything is flown. `bounds.always` holds in every flight besides; a fault
-that by its nature may carry robots out of the fence says how far (`beyond_fence_m`).
+Bounds are stated before the flights. `bounds.always` also holds in every flight; a fault that by
+its nature may carry robots out of the fence says how far (`beyond_fence_m`).
 """
 
 import math
@@ -50,7 +50,7 @@ Phase = Literal["ready", "takeoff", "mission", "return"]
 EVER = math.inf
 # From the greatest height of four robots, at PX4's speed of a landing without a position.
 _DESCENT_S = 20.0 / 0.7
-# Without GPS nothing holds a place any more, and the wind has it all the way down.
+# Without GPS the vehicle cannot hold its position: it drifts with the wind until it is down.
 ADRIFT_M = POSITION_ERROR_M + GREATEST_WIND_M_S * _DESCENT_S
 ADRIFT = "without a position the wind carries it as it comes down, over the fence or onto another"
 # A storm, and the greatest wind besides, carry a vehicle as fast as they blow beyond its airspeed,
@@ -69,8 +69,6 @@ _PARTS_M = 8.0 + 3.0
 # The receiver's error walks by up to 0.8 m between takeoff and landing, and gusts displace it.
 _AT_PAD_M = 3.0
 
-# Bounds of several faults
-
 _OTHERS_FLY_ON = FliesOn(0.9, "others", until_s=20.0)
 _OTHERS_TAKE_OFF = TakesOff(robots="others")
 _OTHERS_HOME, _ALL_HOME = LandsAtPad(_AT_PAD_M, "others"), LandsAtPad(_AT_PAD_M, "all")
@@ -79,18 +77,18 @@ _MISSION_GOES_ON = (_ALL_FLY_ON, _ALL_HOME)
 _STRAIGHT_DOWN, _DOWN = StraightDown(3.0), Down(_LANDING_S)
 _PX4_LANDS_IT = (Lands(1.3), _STRAIGHT_DOWN, _DOWN, _OTHERS_FLY_ON)
 _ONE_STAYS_DOWN = (StaysDown(), _OTHERS_TAKE_OFF)
-# The watchdog asks for it 0.5 s after the last tick; 1 s after the last setpoint PX4 would land.
+# The watchdog commands it 0.5 s after the last tick; PX4 would land 1 s after the last setpoint.
 _HOLDS = Holds(0.8)
 _STANDS = Stands(from_s=_STANDS_AFTER_S, until_s=20.0)
-# Told to stop after 1.1 s, or 1.9 s, it is slower by then even with a lag of 1.3 s, and has not yet
-# begun to land.
+# Commanded to stop after 1.1 s, or 1.9 s, it has slowed down by then even with a lag of 1.3 s, and
+# has not begun to land.
 _BRAKED = Stands(0.8, from_s=2.0, until_s=5.0)
 _BRAKED_LATER = Stands(0.8, from_s=2.6, until_s=6.0)
-# Displaced by a receiver that lies, as long as PX4 keeps a place without it.
+# Displacement by a faulty receiver, while PX4 holds its position without it.
 _NEAR_STILL = StaysNear(10.0, until_s=5.0)
 # Off its height by 1.5 m for 2 s, as estimated; control and estimate may be half a metre off.
 _SINKING_NOTICED = LeavesMission(2.3, below_m=2.0)
-# Without a ground robots hold, but move apart before they land where they are.
+# Without a ground station robots hold, but move apart before they land in place.
 _ALL_STOP = MissionEnds(3.8, "all")
 _ALL_WAIT_AND_LAND = (
     _ALL_STOP,
@@ -106,12 +104,13 @@ _ALL_DOWN = Down(14.0 + _LANDING_S, "all")
 class Fault:
     """A fault of a fleet: injections and their times, and the bounds of a flight with it.
 
-    `what` and `promise` are for people, and of one robot unless they say otherwise. The fault
-    begins in the `phase`, at a time drawn by the seed, and hits that many robots, drawn too (0: the
-    whole fleet). The operator watches for
-    `watched_s`, and then brings all home, unless `home` is False. With `exact` robots know their
+    `what` and `promise` are shown to people, and are of one robot unless they say otherwise. The
+    fault begins in the `phase`, at a time drawn from the seed, and hits `hits` robots, also drawn
+    (0: the whole fleet). The operator watches for `watched_s` and then brings all home, unless
+    `home` is False. With `exact` robots know their
     positions. `settings` are further keys of robot.toml. By its nature the fault may carry the
-    `carried` group so far beyond the fence. `uncovered` says what no margin and no check prevents.
+    `carried` group by `beyond_fence_m` beyond the fence. `uncovered` says what no margin and no
+    check prevents.
     """
 
     name: str

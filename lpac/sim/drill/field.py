@@ -1,4 +1,4 @@
-"""Common part of all fleets of the drill: targets of a fault, orders, true positions."""
+"""Common base of the drill's fleets: targets of a fault, commands, true positions."""
 
 import math
 from abc import ABC, abstractmethod
@@ -31,17 +31,17 @@ from lpac.sim.fleet.layout import Layout
 from lpac.sim.px4.vector import level
 from lpac.sim.scenario import WORLD_SENSOR, Scenario
 
-# Receivers with corrections, whose estimates still wander by 0.15 m along each axis, and heights
-# that hardly walk.
+# Receivers with corrections, whose estimates still drift by 0.15 m along each axis, and heights
+# that hardly drift.
 EXACT = ErrorBudget(
     gps_m=0.6, height_apart_m=0.2, height_common_m=0.0, takeoffs_height_m=0.0, pads_height_m=0.2
 )
-# How long an order that nobody waits for is valid.
+# Validity of a command whose answer is not awaited.
 _ORDER_S = 10.0
 
 
 class Timeline(NamedTuple):
-    """Robots that were hit, and times of the fault and its marks, s of the vehicles' clock."""
+    """Robots hit, and times of the fault and its marks, s on the vehicles' clock."""
 
     hit: tuple[int, ...]
     fault_s: float
@@ -59,32 +59,28 @@ class FaultyVehicle(Protocol):
 
 
 class FaultyFleet(ABC):
-    """A fleet that faults are done to, under its ground, on some kind of vehicles.
+    """A fleet under its ground station, on some kind of vehicles, into which faults are injected.
 
-    `orders` are all that were given, `layout` is what it is.
-
-    It is a `Surroundings` of its vehicles.
+    `orders` are all commands given. It is the `Surroundings` of its vehicles.
     """
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
         self.orders: list[GivenOrder] = []
 
-    # What differs between kinds of vehicles
-
     @property
     @abstractmethod
     def ground(self) -> Ground:
-        """The ground that commands now."""
+        """The ground station in command."""
 
     @property
     @abstractmethod
     def ground_runs(self) -> bool:
-        """Whether it does."""
+        """Whether the ground station runs."""
 
     @abstractmethod
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
-        """Have something happen, so much later."""
+        """Schedule an injection `after_s` from now."""
 
     @abstractmethod
     def all_down(self) -> bool:
@@ -92,16 +88,16 @@ class FaultyFleet(ABC):
 
     @abstractmethod
     def now_s(self) -> float:
-        """The vehicles' clock."""
+        """Time on the vehicles' clock, s."""
 
     @abstractmethod
     def unix_now_s(self) -> float:
-        """Unix time, as whoever writes the robots' logs has it."""
+        """Unix time, as in the robots' logs."""
 
     @property
     @abstractmethod
     def vehicles(self) -> Sequence[FaultyVehicle]:
-        """One for each robot, at least."""
+        """The vehicles, at least one for each robot."""
 
     @property
     @abstractmethod
@@ -114,11 +110,11 @@ class FaultyFleet(ABC):
 
     @abstractmethod
     def send(self, request: Request) -> bool:
-        """The operator commands that, and does not wait; False if there is no ground."""
+        """Send a command without awaiting its answer; False without a ground station."""
 
     @abstractmethod
     def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
-        """Do to these robots what is neither an order nor a fence."""
+        """Apply an injection that is neither a command nor a fence."""
 
     @abstractmethod
     def tracks(self) -> tuple[TrueTrack, ...]:
@@ -129,22 +125,19 @@ class FaultyFleet(ABC):
         return max(map(self.height_m, range(len(self.robots_by_name))))
 
     def lead_s(self, injection: Injection) -> float:
-        """How much earlier it has to happen to be felt in time."""
+        """How much earlier it has to be injected to take effect in time, s."""
         return 0.0
 
     def late_s(self) -> float:
-        """How far the machine that flies them was behind real time."""
+        """How far this machine was behind real time, s."""
         return 0.0
 
-    # What happens
-
     def happen(self, do: Do, hit: tuple[int, ...]) -> None:
-        """Do it to those who are meant."""
+        """Apply an injection to its group of robots."""
         robots = robots_of(do.to, hit, self.layout.scenario.robots)
         match do.injection:
             case OperatorOrders(kind):
                 names = tuple(f"r{robot}" for robot in robots)
-                # Every other kind needs nothing but its robots.
                 kill = RobotCommand("kill", names)
                 self._order(kill if kind == "kill" else of_robots(kind, names))
             case FenceWithout():
@@ -154,7 +147,7 @@ class FaultyFleet(ABC):
                 self.inject(injection, robots)
 
     def noted(self, request: Request) -> Callable[[], None]:
-        """Note that something is commanded now; call the result when it is answered."""
+        """Record a command given now; call the result when it is answered."""
         index = len(self.orders)
         self.orders.append(
             GivenOrder(command_name(request), self._addressed(request), self.now_s(), math.inf)
@@ -194,18 +187,16 @@ class FaultyFleet(ABC):
             ),
         )
 
-    # Where vehicles are
-
     def outwards(self, robot: int) -> Vector:
-        """In the plane: the way to what it takes to be the fence's nearest line."""
+        """Horizontal direction to the fence's nearest line, by the vehicle's estimate."""
         return level(self.layout.way_out(self.vehicles[robot].estimated_position_m)[0].tolist())
 
     def inside_m(self, robot: int) -> float:
-        """How far inside that line the vehicle takes itself to be."""
+        """Estimated distance inside that line, m."""
         return self.layout.way_out(self.vehicles[robot].estimated_position_m)[1]
 
     def place_m(self, robot: int) -> F64:
-        """(2,): the pad that a robot stood on at first, where it really is; north and east."""
+        """(2,): true position of the robot's first pad, north and east, m."""
         pads_m = self.layout.pads_m
         return np.array(self.layout.to_world_m(pads_m[robot % len(pads_m)]))
 
@@ -224,7 +215,7 @@ class FaultyFleet(ABC):
 
 
 def scenario_of(fault: Fault, seed: int, robots: int, sensor: str = WORLD_SENSOR) -> Scenario:
-    """The fleet that flies it: members with keys, on vehicles that err, unless they are exact."""
+    """Scenario of a fault: a fleet with keys, and vehicles with errors unless it is exact."""
     return Scenario(
         robots=robots, seed=seed, secure=True, errors=not fault.exact,
         budget=EXACT if fault.exact else ERRORS, sensor=sensor, fault=fault.name,
@@ -232,7 +223,7 @@ def scenario_of(fault: Fault, seed: int, robots: int, sensor: str = WORLD_SENSOR
 
 
 def settings_of(fault: Fault) -> dict[str, dict[str, object]]:
-    """Its further keys of robot.toml, by table."""
+    """The fault's further keys of robot.toml, by table."""
     settings: dict[str, dict[str, object]] = {}
     for table, key, value in fault.settings:
         settings.setdefault(table, {})[key] = value
@@ -240,12 +231,12 @@ def settings_of(fault: Fault) -> dict[str, dict[str, object]]:
 
 
 def has_remote_control(fault: Fault) -> bool:
-    """Whether its robots are set up for a pilot's remote control, which is on then."""
+    """Whether the fault's robots are set up for a pilot's remote control, which is then on."""
     return settings_of(fault).get("failsafe", {}).get("rc") == "pilot"
 
 
 def supports(kinds: Collection[object], fault: Fault) -> bool:
-    """Whether vehicles that take injections of these kinds fly a fault."""
+    """Whether these kinds of injections include all of a fault's."""
     return all(
         type(do.injection) in kinds or getattr(do.injection, "kind", None) in kinds
         for do in fault.does
@@ -253,11 +244,11 @@ def supports(kinds: Collection[object], fault: Fault) -> bool:
 
 
 def _fence_without(fence: Fence, places_m: list[F64]) -> Fence:
-    """As much of a square fence as leaves these places outside, by half a metre."""
+    """The part of a square fence that leaves these places outside, by half a metre."""
     corners = np.array(fence.vertices_m)
     low_m, high_m = corners.min(axis=0), corners.max(axis=0)
     x_m = min(place_m[0] for place_m in places_m)
-    # What is left on the side with more room.
+    # Keep the side with more room.
     if x_m - low_m[0] > high_m[0] - max(place_m[0] for place_m in places_m):
         high_m[0] = x_m - 0.5
     else:

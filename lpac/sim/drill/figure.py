@@ -1,4 +1,4 @@
-"""One flight of a fault as a figure: where the vehicles really were, and what they were told."""
+"""Figure of a fault's flight: the vehicles' true paths and heights, and PX4's modes."""
 
 from pathlib import Path
 

@@ -1,7 +1,7 @@
-"""One flight of a fault, as its operator flies it, on whatever vehicles there are.
+"""One flight of a fault, on any kind of vehicles.
 
-The operator's part is a procedure of the real ground; what is done to the fleet is put on the
-field's own clock. Everything that is drawn follows from the seed and the fault's name.
+The operator's part is a procedure of the real ground station; injections are scheduled on the
+field's own clock. All random values follow from the seed and the fault's name.
 """
 
 import zlib
@@ -25,7 +25,7 @@ from lpac.sim.drill.field import FaultyFleet, Timeline
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.scenario import Scenario
 
-# When a fault begins, after its phase has.
+# Range of a fault's start, s after the start of its phase.
 _BEGINS_S: Mapping[Phase, tuple[float, float]] = {
     "ready": (1.0, 2.0), "takeoff": (0.0, 3.0), "mission": (2.0, 14.0), "return": (0.5, 12.0),
 }  # fmt: skip
@@ -45,7 +45,7 @@ def drawn(fault: Fault, seed: int, robots: int) -> tuple[tuple[int, ...], float]
 
 
 def to_ready(field: FaultyFleet) -> Procedure[None]:
-    """All are heard, and have passed their checks."""
+    """Procedure until all robots are connected and have passed their checks."""
     yield Until(lambda told: all(robot.fresh for robot in told.robots), _HEARD_S)
     for request in (SetOrigin(ORIGIN), Enable()):
         yield from _command(field, request)
@@ -53,13 +53,13 @@ def to_ready(field: FaultyFleet) -> Procedure[None]:
 
 
 def to_mission(field: FaultyFleet) -> Procedure[None]:
-    """From there into the mission, as far as it goes: who refuses stays behind."""
+    """Procedure from there into the mission; robots that refuse stay behind."""
     for request in (Takeoff(), Start()):
         yield from _command(field, request)
 
 
 def fly(field: FaultyFleet, fault: Fault, scenario: Scenario) -> Procedure[Timeline]:
-    """From `to_ready`, or for a fault in the mission or later from `to_mission`, to the end."""
+    """Procedure from `to_ready`, or `to_mission` for a fault in a later phase, to the end."""
     hit, delay_s = drawn(fault, scenario.seed, scenario.robots)
     delay_s = max([delay_s, *(field.lead_s(do.injection) - do.at_s for do in fault.does)])
     began_s = field.now_s()
@@ -84,7 +84,7 @@ def fly(field: FaultyFleet, fault: Fault, scenario: Scenario) -> Procedure[Timel
 
 
 def _command(field: FaultyFleet, request: Request) -> Procedure[CommandReport | None]:
-    """Report of the command; None if there is no ground, or it does not end."""
+    """Report of the command; None without a ground station, or on timeout."""
     if not field.ground_runs:
         return None
     answered = field.noted(request)

@@ -1,7 +1,7 @@
 """Injections of faults into a fleet, and their times.
 
-An injection into a vehicle is a function of the vehicle, its robot and its surroundings. Called
-without these three it makes the `OnVehicle` that applies it later. All others are data.
+An injection into a vehicle is a function of vehicle, robot and surroundings. Called without these
+three it returns an `OnVehicle`, which applies it later. All other injections are data.
 """
 
 import math
@@ -27,26 +27,26 @@ _Arguments = ParamSpec("_Arguments")
 
 
 class Surroundings(Protocol):
-    """Places around a vehicle, in the world's frame, north and east, m; robots count cyclically."""
+    """Places around a vehicle: world frame, north and east, m; robot numbers wrap around."""
 
     def outwards(self, robot: int) -> Vector:
-        """In the plane: the way to the nearest line of the fence."""
+        """Horizontal direction to the nearest line of the fence."""
         ...
 
     def inside_m(self, robot: int) -> float:
-        """How far inside that line the vehicle takes itself to be."""
+        """Estimated distance inside that line, m."""
         ...
 
     def height_m(self, robot: int) -> float:
-        """The height that a robot flies at."""
+        """Flight height of a robot, m."""
         ...
 
     def highest_m(self) -> float:
-        """The height of the robot that flies highest."""
+        """Greatest flight height of all robots, m."""
         ...
 
     def place_m(self, robot: int) -> F64:
-        """(2,): the pad that a robot stood on at first, where it really is."""
+        """(2,): true position of the robot's first pad."""
         ...
 
 
@@ -54,7 +54,7 @@ class Surroundings(Protocol):
 class OnVehicle:
     """An injection into a vehicle: a function `do` of this module and its arguments.
 
-    `kind` is the function as the module has it. A kind of `BY_PILOTS` takes any `PilotedVehicle`,
+    `kind` is the public function of this module. Those in `BY_PILOTS` take any `PilotedVehicle`,
     others a `Px4Vehicle`.
     """
 
@@ -64,7 +64,7 @@ class OnVehicle:
     named: dict[str, Any]
 
     def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
-        """Inject it now."""
+        """Apply the injection now."""
         self.do(vehicle, robot, around, *self.arguments, **self.named)
 
 
@@ -92,7 +92,7 @@ def change_battery(vehicle: Px4Vehicle, _: int, around: Surroundings, remaining:
 
 @_on_vehicle
 def drain(vehicle: Px4Vehicle, _: int, around: Surroundings, remaining: float) -> None:
-    """Drain the battery to that share in flight: PX4's own simulator drains none while disarmed."""
+    """Drain the battery to that share in flight; PX4's own simulator cannot while disarmed."""
     vehicle.battery_remaining = remaining
 
 
@@ -104,7 +104,7 @@ def silence(vehicle: Px4Vehicle, _: int, around: Surroundings, sensor: Simulated
 
 @_on_vehicle
 def report_accuracy(vehicle: Px4Vehicle, _: int, around: Surroundings, accuracy_m: float) -> None:
-    """Have the receiver report that accuracy."""
+    """Make the receiver report that accuracy."""
     vehicle.gps_told_m = accuracy_m
 
 
@@ -116,7 +116,7 @@ def jump_fix(vehicle: Px4Vehicle, robot: int, around: Surroundings, by_m: float)
 
 @_on_vehicle
 def repeat_fix(vehicle: Px4Vehicle, _: int, around: Surroundings) -> None:
-    """Have the receiver repeat its last fix as a fresh one, with velocity 0."""
+    """Make the receiver repeat its last fix as a fresh one, with velocity 0."""
     vehicle.receiver.stuck = True
 
 
@@ -125,7 +125,7 @@ def falsify_fixes(
     vehicle: Px4Vehicle, robot: int, around: Surroundings, *,
     creep_m_s: float = 0.0, velocity_bias_m_s: float = 0.0, scatter_m: float = 0.0,
 ) -> None:  # fmt: skip
-    """Let fixes walk away, bias their velocity (both outwards), or scatter them."""
+    """Make fixes drift or bias their velocity, both outwards, or scatter them."""
     outwards = around.outwards(robot)
     vehicle.receiver.creep_m_s = times(outwards, creep_m_s)
     vehicle.receiver.velocity_bias_m_s = times(outwards, velocity_bias_m_s)
@@ -134,7 +134,7 @@ def falsify_fixes(
 
 @_on_vehicle
 def freeze_estimate(vehicle: Px4Vehicle, _: int, around: Surroundings) -> None:
-    """Freeze estimated position and velocity, which PX4 goes on sending."""
+    """Freeze the estimated position and velocity that PX4 sends."""
     vehicle.estimate_frozen = True
 
 
@@ -143,9 +143,9 @@ def drift_estimate(
     vehicle: Px4Vehicle, robot: int, around: Surroundings, *,
     inwards_m_s: float = 0.0, down_m_s: float = 0.0,
 ) -> None:  # fmt: skip
-    """Let estimate and receiver walk away from the truth, inwards and down.
+    """Make estimate and receiver drift from the truth, inwards and down.
 
-    That leads the vehicle outwards and up.
+    The vehicle is thereby led outwards and up.
     """
     north, east, _ = times(around.outwards(robot), -inwards_m_s)
     vehicle.gps_drift_m_s = north, east, down_m_s
@@ -153,13 +153,13 @@ def drift_estimate(
 
 @_on_vehicle
 def jump_height(vehicle: Px4Vehicle, _: int, around: Surroundings, up_m: float) -> None:
-    """Let the estimated height jump, without a new origin."""
+    """Make the estimated height jump, without a new origin."""
     vehicle.gps_offset_m = minus(vehicle.gps_offset_m, (0.0, 0.0, up_m))
 
 
 @_on_vehicle
 def jump_outside(vehicle: Px4Vehicle, robot: int, around: Surroundings, beyond_m: float) -> None:
-    """Let estimate and receiver jump to that distance beyond the fence."""
+    """Make estimate and receiver jump to that distance beyond the fence."""
     jump_m = times(around.outwards(robot), around.inside_m(robot) + beyond_m)
     vehicle.gps_offset_m = plus(vehicle.gps_offset_m, jump_m)
 
@@ -180,7 +180,7 @@ def jump_origin(
 
 @_on_vehicle
 def jump_heading(vehicle: Px4Vehicle, _: int, around: Surroundings, by_deg: float) -> None:
-    """Let the estimated heading jump."""
+    """Make the estimated heading jump."""
     vehicle.compass_jump_rad = math.radians(by_deg)
 
 
@@ -196,7 +196,7 @@ def blow(
 
 @_on_vehicle
 def weaken_motors(vehicle: Px4Vehicle, _: int, around: Surroundings, loss: float) -> None:
-    """Take that share of the thrust."""
+    """Reduce the greatest thrust by that share."""
     vehicle.motor_loss = loss
 
 
@@ -224,7 +224,7 @@ def set_parameter(
 def carry_to_pad(
     vehicle: Px4Vehicle, robot: int, around: Surroundings, to_pad: int = 1, beside_m: float = 0.0
 ) -> None:
-    """Carry a disarmed vehicle to the pad of the robot `to_pad` further on, or beside it."""
+    """Carry a disarmed vehicle to the pad of robot + `to_pad`, or `beside_m` north of it."""
     if not vehicle.armed:
         north_m, east_m = around.place_m(robot + to_pad).tolist()
         vehicle.position_m = np.array([north_m + beside_m, east_m, 0.0])
@@ -232,9 +232,9 @@ def carry_to_pad(
 
 @_on_vehicle
 def pilot_flies_over(vehicle: Px4Vehicle, robot: int, around: Surroundings, pad: int = 1) -> None:
-    """Fly it by pilot over the pad of the robot `pad` further on, at its height, for a second."""
+    """Fly it by pilot over the pad of robot + `pad`, at that robot's height, for a second."""
     pad_m, height_m = around.place_m(robot + pad), around.height_m(robot + pad)
-    # Over everybody's heads on the way there.
+    # Above all robots on the way there.
     if math.dist(vehicle.position_m[:2], pad_m) > _PILOT_ARRIVED_M:
         height_m = around.highest_m() + _PILOT_ABOVE_M
     target_m = np.array([*pad_m, -height_m])
@@ -253,7 +253,7 @@ def lose_remote_control(vehicle: PilotedVehicle, _: int, around: Surroundings) -
 
 @_on_vehicle
 def set_mode(vehicle: PilotedVehicle, _: int, around: Surroundings, mode: Px4Mode) -> None:
-    """Ask PX4 for a mode, as a ground station would."""
+    """Command a mode of PX4, as a ground station would."""
     vehicle.set_mode(mode)
 
 
@@ -262,14 +262,14 @@ def pilot_flies(
     vehicle: PilotedVehicle, robot: int, around: Surroundings, outwards_m_s: float = 0.0,
     up_m_s: float = 0.0,
 ) -> None:  # fmt: skip
-    """Take it by remote control, and fly outwards and up at these speeds."""
+    """Take over by remote control, and fly outwards and up at these speeds."""
     north, east, _ = times(around.outwards(robot), outwards_m_s)
     vehicle.pilot(Px4Mode.POSCTL, (north, east, -up_m_s))
 
 
 @_on_vehicle
 def pilot_lands(vehicle: PilotedVehicle, _: int, around: Surroundings) -> None:
-    """Land it by remote control."""
+    """Land by remote control."""
     vehicle.move_sticks(())
     vehicle.set_mode(Px4Mode.LAND)
 
@@ -279,21 +279,21 @@ BY_PILOTS = (lose_remote_control, set_mode, pilot_flies, pilot_lands)
 
 @dataclass(frozen=True, slots=True)
 class RobotProgram:
-    """A robot's program dies (kill -9, no power), ends (SIGTERM), starts again, or is unwatched."""
+    """A robot's program dies (kill -9, no power), ends (SIGTERM), starts or loses its watchdog."""
 
     event: Literal["dies", "ends", "starts", "loses its watchdog"]
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramStops:
-    """The whole program stops for a time, as by SIGSTOP and SIGCONT."""
+    """The whole program stops for a while, as by SIGSTOP and SIGCONT."""
 
     for_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class LoopHangs:
-    """One loop of a program hangs for a time."""
+    """One loop of a program hangs for a while."""
 
     loop: Literal["control", "perception", "policy", "preflight", "status"]
     for_s: float
@@ -348,7 +348,7 @@ class Laptop:
 
 @dataclass(frozen=True, slots=True)
 class GroundStops:
-    """The ground's program stops for a time, as on a laptop that sleeps."""
+    """The ground station's program stops for a while, as on a sleeping laptop."""
 
     for_s: float
 
@@ -369,7 +369,7 @@ class SecondLaptop:
 
 @dataclass(frozen=True, slots=True)
 class OperatorOrders:
-    """The operator commands robots, and does not wait for the answer."""
+    """The operator sends a command without awaiting the answer."""
 
     kind: Literal["start", "rejoin", "kill", "hold", "return", "land", "resume"]
 
@@ -388,9 +388,9 @@ Injection = (
 
 @dataclass(frozen=True, slots=True)
 class Do:
-    """An injection `at_s` after the fault's begin, into a group of robots.
+    """An injection `at_s` after the start of the fault, into a group of robots.
 
-    A `mark` names the time for bounds. An injection into ground or radio happens once.
+    `mark` names its time for bounds. An injection into ground station or radio happens once.
     """
 
     injection: Injection

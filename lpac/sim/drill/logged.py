@@ -1,4 +1,4 @@
-"""Flights of faults that leave their logs and a figure."""
+"""Flights of faults that keep their logs and a figure."""
 
 import shutil
 from collections.abc import Callable
@@ -10,14 +10,14 @@ from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.figure import write_figure
 from lpac.sim.drill.outcome import LATE_S, FlightOutcome, outcome_of
 
-# What a late machine broke says nothing, and is flown again.
+# A promise broken on an overloaded machine says nothing: fly again.
 _TRIES = 3
 
 
 def fly_logged(fault: Fault, fly: Callable[[], FlightRecord], folder: Path) -> FlightOutcome:
-    """Fly into a new `folder` and judge; again if it broke a promise while this machine was late.
+    """Fly into a new `folder` and judge; repeat if a promise broke while this machine was late.
 
-    What that flight left stays beside `folder`, in one whose name ends in late-1, and so on.
+    The files of late flights are kept next to `folder`, in NAME-late-1, and so on.
     """
 
     def flown() -> FlightRecord:

@@ -1,4 +1,4 @@
-"""The outcome of one flight of a fault: what was measured, judged by its bounds."""
+"""The outcome of one flight of a fault: its figures, judged by their bounds."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,14 +8,14 @@ from lpac.analysis.flight import FlightRecord
 from lpac.sim.drill.bounds import Figure, judge
 from lpac.sim.drill.faults import Fault
 
-# Two ticks of control that a robot left out in a flight, or as much of the vehicles' time.
+# Two control ticks that a robot skipped, or as much of the vehicles' time.
 LATE_S = 0.25
 
 
 class FlightOutcome(NamedTuple):
-    """Judged figures of one flight. `error` says what ended it early, such as a defect; else "".
+    """Judged figures of one flight; `error` says why it ended early or was not judged, else "".
 
-    `late_s` is how far the machine was behind real time, if it was flown in that.
+    `late_s` is how far the machine was behind, of a flight in real time.
     """
 
     figures: tuple[Figure, ...]
@@ -24,7 +24,7 @@ class FlightOutcome(NamedTuple):
 
     @property
     def broken(self) -> tuple[Figure, ...]:
-        """The promises that did not hold."""
+        """Figures beyond their limits."""
         return tuple(figure for figure in self.figures if figure.broken)
 
     @property
@@ -34,9 +34,10 @@ class FlightOutcome(NamedTuple):
 
 
 def outcome_of(fault: Fault, flown: Callable[[], FlightRecord]) -> FlightOutcome:
-    """Fly and judge. What raises is an outcome, too: no other flight is lost for it.
+    """Fly and judge. An exception is an outcome too, so that other flights go on.
 
-    Limits are the same in real time. So what breaks one while the machine is late is not judged.
+    Limits are the same in real time, so a flight that breaks one while the machine is late is not
+    judged.
     """
     try:
         flight = flown()

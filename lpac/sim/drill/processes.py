@@ -1,7 +1,7 @@
-"""Faults in real time: the robots' programs and the ground's, on simulated vehicles or real PX4s.
+"""Faults in real time: programs of robots and ground station, on simulated vehicles or real PX4s.
 
-Flights are judged by the same bounds as on the simulated clock. How far this machine was behind is
-part of a flight's truth.
+Flights are judged by the same bounds as on the simulated clock. The record has how far this machine
+was behind real time.
 """
 
 import heapq
@@ -47,12 +47,12 @@ from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import Px4Build
 from lpac.sim.sitl.ground_station import RealVehicle, RealVehicles
 
-# What is done to programs, and what their operator does, on whatever vehicles.
+# Injections into programs, and commands of the operator, on any vehicles.
 _PROGRAMS = (RobotProgram, ProgramStops, Laptop, GroundStops, OperatorOrders, FenceWithout)
-# Nobody cuts this machine's own network, fills its disk or steps its clock, and no loop of a
-# program that is as in the field hangs on demand.
+# Not supported: cutting this machine's network, filling its disk, stepping its clock, or hanging
+# one loop of a real program.
 MAVLINK: tuple[object, ...] = (OnVehicle, *_PROGRAMS)
-# What a ground station can do to a real one, and PX4's own simulator to its vehicle.
+# Injections by a ground station, or by PX4's own simulator.
 _ON_REAL: dict[object, Callable[..., None]] = {
     injections.lose_gps: RealVehicle.lose_gps,
     injections.drain: RealVehicle.drain,
@@ -64,27 +64,27 @@ _ON_REAL: dict[object, Callable[..., None]] = {
 }
 PX4: tuple[object, ...] = (*_ON_REAL, *BY_PILOTS, *_PROGRAMS)
 
-# How long a command may take, each robot.
+# Timeout of a command, for each robot.
 _PATIENCE_S = 60.0
-# A vehicle steps every 0.02 s; after as long without a step somebody looks all the same.
+# A vehicle steps every 0.02 s; without a step, look after this time.
 _LOOK_S = 0.5
 _KILLED_S = 10.0
-# A laptop needs less than half of it. If it takes more, it was gone for longer than it should be.
+# A laptop needs less than half of it; a longer start counts as lateness.
 _GROUND_STARTS_WITHIN_S = 2.0
-# Until PX4 (v1.17) tells of a battery that it is below 25 % or 15 %, once it fell to 0.5 % less.
+# Delay until PX4 (v1.17) reports a battery below 25 % or 15 %, after a fall to 0.5 % less.
 _BATTERY_TOLD_S = 5.5
 
 T = TypeVar("T")
 
 
 class ProcessField(FaultyFleet):
-    """A fleet of processes, and what is done to it; a context, within those of its parts.
+    """A fleet of processes under faults; a context, within those of its parts.
 
-    What is due is done by a thread of its own, on the vehicles' clock.
+    A thread of its own runs the injections, on the vehicles' clock.
     """
 
     def __init__(self, fleet: Fleet, ground: GroundProgram, stepped: threading.Condition) -> None:
-        """`stepped` is held by whoever changes vehicles, and notified once they have stepped."""
+        """Hold `stepped` to change vehicles; it is notified after each step."""
         super().__init__(fleet.layout)
         self.fleet = fleet
         self.stepped = stepped
@@ -115,11 +115,9 @@ class ProcessField(FaultyFleet):
             self.stepped.notify_all()
         self._thread.join()
 
-    # The drill's field
-
     @property
     def ground(self) -> Ground:
-        """The operator's, as it told last."""
+        """The operator's ground station, as last reported."""
         return self._ground.told
 
     @property
@@ -130,28 +128,26 @@ class ProcessField(FaultyFleet):
         self._at(self.now_s() + after_s, partial(self.happen, do, hit))
 
     def carry_out(self, procedure: Procedure[T]) -> T:
-        """Let time pass until it is through; a command that does not end is answered by None.
+        """Run a procedure; a command that times out is answered by None.
 
-        Raises what kept a fault from happening, and OverloadError or VehicleError.
+        Raises the error of a failed injection, OverloadError or VehicleError.
         """
         return carry_out(procedure, self._command, self._wait)
 
-    # What all kinds of vehicles have in common
-
     @property
     def robots_by_name(self) -> dict[str, int]:
-        """By their programs."""
+        """Robot ids by the names of the programs."""
         return {robot.name: robot.robot_id for robot in self.fleet.robots}
 
     def height_m(self, robot: int) -> float:
-        """By its robot.toml."""
+        """Flight height by the robot's robot.toml, m."""
         return self._heights_m[robot % len(self._heights_m)]
 
     def send(self, request: Request) -> bool:
-        """A client of the ground waits for the answer, beside the flight."""
+        """Send a command; a thread awaits the answer."""
 
         def command() -> None:
-            # The ground may end before it answers; then there is no answer.
+            # The ground station may end before it answers.
             try:
                 self._ground.command(request)
             except GroundError:
@@ -182,15 +178,15 @@ class ProcessField(FaultyFleet):
                     self._inject_program(injection, robot)
 
     def unix_now_s(self) -> float:
-        """This machine's."""
+        """This machine's Unix time."""
         return time.time()
 
     def late_s(self) -> float:
-        """As it was in `fly`."""
+        """Lateness measured in `fly`, s."""
         return self._late_s
 
     def fly(self, fault: Fault, scenario: Scenario) -> Timeline:
-        """From the programs' start to the end. Raises what `carry_out` does."""
+        """Fly from the programs' start to the end. Raises the same as `carry_out`."""
         self.carry_out(to_ready(self))
         self.fleet.begin()
         began_s = time.monotonic()
@@ -201,9 +197,9 @@ class ProcessField(FaultyFleet):
         return timeline
 
     def _late_since_s(self, began_s: float) -> float:
-        """By the vehicles' time left out, a robot's control, or a ground that starts again.
+        """Greatest lateness, s: of the vehicles, of a robot's control, or of a ground's restart.
 
-        Of those that nothing stopped.
+        Programs that an injection stopped do not count.
         """
         late_s = [self.vehicles_late_s(began_s), self._ground_late_s]
         for robot in self.robots_by_name.values():
@@ -218,11 +214,11 @@ class ProcessField(FaultyFleet):
 
     @abstractmethod
     def inject_vehicle(self, injection: OnVehicle, robot: int) -> None:
-        """Now, while `stepped` is held."""
+        """Inject now; the caller holds `stepped`."""
 
     @abstractmethod
     def vehicles_late_s(self, began_s: float) -> float:
-        """How long the vehicles stood still since then (`time.monotonic()`)."""
+        """How far the vehicles fell behind since then (`time.monotonic()`), s."""
 
     def _inject_program(self, injection: Injection, index: int) -> None:
         robot = self.fleet.robots[index]
@@ -233,7 +229,7 @@ class ProcessField(FaultyFleet):
             case RobotProgram("ends"):
                 robot.send_signal(signal.SIGTERM)
             case RobotProgram("starts"):
-                # What restarts a program that hangs kills it first.
+                # systemd too kills a hanging program before the restart.
                 robot.send_signal(signal.SIGKILL)
                 robot.wait(_KILLED_S)
                 robot.start()
@@ -244,8 +240,6 @@ class ProcessField(FaultyFleet):
                 robot.kill_watchdog()
             case _:
                 raise TypeError(f"{injection} is not done to a program")
-
-    # Time
 
     def _at(self, at_s: float, happen: Callable[[], None]) -> None:
         with self.stepped:
@@ -299,20 +293,20 @@ class ProcessField(FaultyFleet):
 
 
 class MavlinkField(ProcessField):
-    """On simulated vehicles, which a thread of this process flies."""
+    """Field with simulated vehicles, which a thread of this process flies."""
 
     def __init__(self, fleet: Fleet, ground: GroundProgram, simulated: SimulatedVehicles) -> None:
         super().__init__(fleet, ground, simulated.stepped)
         self._simulated = simulated
 
     def now_s(self) -> float:
-        """Of the vehicles, which are all of one time."""
+        """Time of the vehicles, which share one clock, s."""
         with self.stepped:
             return self.vehicles[0].time_s
 
     @property
     def vehicles(self) -> Sequence[Px4Vehicle]:
-        """Themselves."""
+        """The simulated vehicles."""
         return self._simulated.vehicles
 
     def all_down(self) -> bool:
@@ -323,11 +317,11 @@ class MavlinkField(ProcessField):
             )
 
     def vehicles_late_s(self, began_s: float) -> float:
-        """In all."""
+        """Total lateness of the vehicles, s."""
         return self.fleet.lateness().vehicles_s
 
     def inject_vehicle(self, injection: OnVehicle, robot: int) -> None:
-        """To the vehicle itself."""
+        """Inject into the simulated vehicle."""
         injection.apply(self.vehicles[robot], robot, self)
 
     def tracks(self) -> tuple[TrueTrack, ...]:
@@ -337,7 +331,7 @@ class MavlinkField(ProcessField):
 
 
 class Px4Field(ProcessField):
-    """On real PX4s, whose vehicles are PX4's own model; times count from its making."""
+    """Field with real PX4s and PX4's own vehicle model; its clock starts at its creation."""
 
     def __init__(self, fleet: Fleet, ground: GroundProgram, px4s: RealVehicles) -> None:
         super().__init__(fleet, ground, px4s.stepped)
@@ -345,17 +339,17 @@ class Px4Field(ProcessField):
         self._made_s = time.monotonic()
 
     def lead_s(self, injection: Injection) -> float:
-        """A battery that falls at once is told by PX4 through a filter."""
+        """PX4's filter delays its report of a sudden drop of the battery."""
         is_drain = isinstance(injection, OnVehicle) and injection.kind is injections.drain
         return _BATTERY_TOLD_S if is_drain else 0.0
 
     def now_s(self) -> float:
-        """This machine's."""
+        """Time since the creation, s."""
         return time.monotonic() - self._made_s
 
     @property
     def vehicles(self) -> Sequence[RealVehicle]:
-        """As a ground station hears them."""
+        """The vehicles as a ground station receives them."""
         return self._px4s.vehicles
 
     def all_down(self) -> bool:
@@ -363,15 +357,15 @@ class Px4Field(ProcessField):
             return all(vehicle.landed and not vehicle.armed for vehicle in self.vehicles)
 
     def vehicles_late_s(self, began_s: float) -> float:
-        """At once: a PX4's clock runs slow by some per cent on a busy machine, and its timers do.
+        """The longest standstill of a PX4's clock, s.
 
-        That is part of a flight.
+        On a busy machine the clock and its timers run some per cent slow, which is allowed.
         """
         assert isinstance(self.fleet.vehicles, Px4Build)
         return self.fleet.vehicles.stood_still_s(began_s)
 
     def inject_vehicle(self, injection: OnVehicle, robot: int) -> None:
-        """By its ground station's link, or its pilot's remote control."""
+        """Inject over the ground station's link, or by the pilot's remote control."""
         vehicle = self.vehicles[robot]
         if injection.kind in BY_PILOTS:
             injection.apply(vehicle, robot, self)
@@ -379,23 +373,25 @@ class Px4Field(ProcessField):
             _ON_REAL[injection.kind](vehicle, *injection.arguments, **injection.named)
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """By PX4's own logs, which are whole once it has ended.
+        """True tracks by PX4's own logs, which are complete once it has ended.
 
-        Raises VehicleError without one, or if a PX4 has not taken what a fault is done by.
+        Raises VehicleError without a log, or if a PX4 did not confirm an injected parameter.
         """
         tracks = self.fleet.vehicles.tracks()
         for robot, track in enumerate(tracks):
             vehicle = self.vehicles[robot]
             if vehicle.unconfirmed:
                 names = ", ".join(vehicle.unconfirmed)
-                raise VehicleError(f"could not be flown: the PX4 of r{robot} did not take {names}")
+                raise VehicleError(
+                    f"could not be flown: the PX4 of r{robot} did not confirm {names}"
+                )
             if not len(track.mode):
                 raise VehicleError(f"the PX4 of r{robot} has left no log of its flight")
         return tuple(track.shifted(-self._made_s) for track in tracks)
 
 
 def fly_fault(fleet: Fleet, fault: Fault) -> FlightRecord:
-    """One flight of the fault; the fleet has its settings."""
+    """Fly the fault once; the fleet was made with its settings."""
     with (
         fleet,
         GroundProgram(fleet.fleet_toml, fleet.name) as ground,
@@ -411,7 +407,7 @@ def fly_fault(fleet: Fleet, fault: Fault) -> FlightRecord:
 
 @contextmanager
 def process_field(fleet: Fleet, ground: GroundProgram) -> Iterator[ProcessField]:
-    """The field of these programs, whatever they fly; it ends before they do."""
+    """The field for the fleet's kind of vehicles; it ends before the programs."""
     with ExitStack() as stack:
         field: ProcessField
         if fleet.simulated is not None:

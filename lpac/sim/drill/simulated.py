@@ -1,4 +1,4 @@
-"""Faults on the simulated clock: whole robots and the real ground, in this process."""
+"""Faults on the simulated clock: whole robots and the real ground station, in this process."""
 
 import math
 import tempfile
@@ -49,14 +49,13 @@ from lpac.sim.scenario import WORLD_SENSOR, Scenario
 _BESIDE_M = 3.0
 # The other operator.
 _SECOND = "second"
-# All that there is.
 SUPPORTED: tuple[object, ...] = get_args(Injection)
 
 T = TypeVar("T")
 
 
 class SimulatedField(FaultyFleet):
-    """A simulated fleet, and what is done to it."""
+    """A simulated fleet under faults."""
 
     def __init__(self, fleet: SimulatedFleet) -> None:
         super().__init__(fleet.layout)
@@ -64,16 +63,14 @@ class SimulatedField(FaultyFleet):
         self._operator = next(iter(fleet.grounds))
 
     def copy(self) -> "SimulatedField":
-        """The same once more, as it is now."""
+        """Independent copy of the current state."""
         copied = SimulatedField(self.fleet.copy())
         copied.orders = list(self.orders)
         return copied
 
-    # The drill's field
-
     @property
     def ground(self) -> SimulatedGround:
-        """The operator's, which may have started again."""
+        """The operator's ground station, which may have been restarted."""
         return self.fleet.grounds[self._operator]
 
     @property
@@ -81,11 +78,11 @@ class SimulatedField(FaultyFleet):
         return self.ground.runs
 
     def now_s(self) -> float:
-        """The simulated clock."""
+        """Simulated time, s."""
         return self.fleet.schedule.monotonic_s()
 
     def unix_now_s(self) -> float:
-        """Of all clocks that were not stepped."""
+        """Unix time of the clocks that were not stepped."""
         return self.fleet.schedule.unix_s()
 
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
@@ -98,7 +95,7 @@ class SimulatedField(FaultyFleet):
         )
 
     def carry_out(self, procedure: Procedure[T]) -> T:
-        """Let time pass until it is through; a command that does not end is answered by None."""
+        """Run a procedure; a command that times out is answered by None."""
 
         def answer(wanted: Request | Until) -> Any:
             with suppress(NothingComesError):
@@ -106,16 +103,14 @@ class SimulatedField(FaultyFleet):
 
         return carry_out(procedure, answer, answer)
 
-    # What a kind of vehicles has of its own
-
     @property
     def vehicles(self) -> Sequence[Px4Vehicle]:
-        """Those of second programs come last."""
+        """All vehicles; those of second programs come last."""
         return [each.vehicle for each in self.fleet.vehicles]
 
     @property
     def robots_by_name(self) -> dict[str, int]:
-        """By the ground's setup."""
+        """Robot ids by the names in the ground station's setup."""
         return dict(self.ground.setup.robots)
 
     def height_m(self, robot: int) -> float:
@@ -123,7 +118,7 @@ class SimulatedField(FaultyFleet):
         return config.flight.slot_height_m
 
     def send(self, request: Request) -> bool:
-        """The ground begins with it."""
+        """Begin a command at the ground station."""
         if self.ground_runs:
             self.ground.node.begin(request)
         return self.ground_runs
@@ -205,17 +200,17 @@ class SimulatedField(FaultyFleet):
 
 
 class _Bases(NamedTuple):
-    """Fleets that are ready, and that fly their mission: flights are copies of them."""
+    """Fleets in the ready state and in the mission, copied for each flight."""
 
     ready: SimulatedField
     mission: SimulatedField
 
 
 class SimulatedDrill:
-    """Flies faults on the simulated clock, one by one; those of one scenario share their begin.
+    """Fly faults on the simulated clock, one by one; those of one scenario share their start.
 
-    A flight follows from fault, scenario and bundle, whatever was flown before. Sensors of other
-    types than the built-in one may have a device, or a state: their flights share nothing.
+    A flight depends on fault, scenario and bundle alone. Sensors other than the built-in one may
+    have a device or a state, so their flights share nothing.
     """
 
     def __init__(self, bundle: Path) -> None:
@@ -224,7 +219,7 @@ class SimulatedDrill:
         self._bases: _Bases | None = None
 
     def fly(self, scenario: Scenario, logs: Path | None = None) -> FlightRecord:
-        """One flight of its fault. With `logs` the robots write theirs in that folder."""
+        """Fly the scenario's fault. The robots write their logs in the folder `logs`, if given."""
         fault = FAULTS[scenario.fault]
         on_ground = fault.phase in ("ready", "takeoff")
         if logs is None and scenario.sensor == WORLD_SENSOR:
@@ -269,7 +264,7 @@ def _one(wanted: Any) -> Procedure[Any]:
 
 
 def _beside_m(places_m: F64, robot: int) -> tuple[float, float]:
-    """A place beside the robot's, where it is in nobody's way who stands at `places_m` (N, 2)."""
+    """A place near the robot's, clear of the others at `places_m` (N, 2)."""
     angles_rad = np.arange(8) * (math.pi / 4.0)
     around_m = places_m[robot] + _BESIDE_M * np.column_stack(
         [np.cos(angles_rad), np.sin(angles_rad)]
