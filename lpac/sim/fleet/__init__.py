@@ -1,1 +1,1 @@
-"""A fleet of real robot programs as processes, each with a vehicle of its own."""
+"""Simulated fleets of whole robots: as processes, or on a simulated clock."""

@@ -1,4 +1,4 @@
-"""Other agents under a robot's policy than the policy's own."""
+"""Agents that replace a policy's own in simulation."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -11,7 +11,7 @@ from edge.policy.lpac.policy import LpacAgent
 
 
 class PolicyWithAgents:
-    """A policy that was tried, with agents made by `agent`. See `Policy`."""
+    """A verified policy with agents made by `agent`. See `Policy`."""
 
     def __init__(self, policy: Policy, agent: Callable[[], Agent]) -> None:
         self._policy = policy
@@ -33,27 +33,27 @@ class PolicyWithAgents:
         return self._policy.message_size
 
     def verify(self) -> Iterator[GoldenCheck]:
-        """Nothing is computed anew."""
+        """Yield nothing: the policy is already verified."""
         return iter(())
 
 
 class DeferredAgent(LpacAgent):
-    """Computes features once it decides: of two observations between, one is of no use.
+    """`LpacAgent` that computes features only when it decides, of the last observation.
 
-    The steps are those of `LpacAgent`. What it perceived cannot be logged.
+    The steps are those of `LpacAgent`, but its features cannot be logged.
     """
 
     _seen: Observation | None = None
     _features: F32 = np.zeros(0, np.float32)
 
     def observe(self, observation: Observation) -> Perceived:
-        """Keep the observation, and give no features."""
-        # Its map is valid until the next one's.
+        """Keep the observation; returns no features."""
+        # Its map is valid until the next observation.
         self._seen = observation
         return Perceived(np.zeros(0, np.float32), {})
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
-        """Of the last observation, whose place `features` take."""
+        """Step on the last observation; `features` are ignored."""
         if self._seen is not None:
             self._features, self._seen = super().observe(self._seen).features, None
         return super().step(self._features, payloads, degree)

@@ -1,4 +1,4 @@
-"""One flight of a fleet on the simulated clock, by a script of the real ground."""
+"""One flight of a fleet on the simulated clock, by a script of the real ground station."""
 
 import zlib
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from lpac.sim.fleet.vehicles import track_of
 from lpac.sim.points import SAMPLE_S
 from lpac.sim.scenario import Scenario
 
-# No flight lasts so long, and as many of them end before the year 2038.
+# Start times this far apart, longer than any flight, and so many that all end before 2038.
 _APART_S, _BEGINNINGS = 1000.0, 340_000
 
 
@@ -38,17 +38,17 @@ def fly_simulated(
 ) -> FlightRecord:
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
-    Robots fly the bundle at the path `bundle`, which stays where it is; `say` is told each step of
-    the script, and when it begins on the simulated clock. With `logs` the robots write theirs below
-    `folder`, in robots/ID/logs; `recorded` is the folder of such a flight, whose policies' steps
-    are taken again. Times, positions and costs are in the record; `problem` says what kept the
-    script from its end. Of what robots log meanwhile only errors are shown.
+    Robots read the bundle at the path `bundle`; `say` gets each step of the script with its start
+    on the simulated clock. With `logs` the robots write logs to robots/ID/logs in `folder`;
+    `recorded` is the folder of such a flight, whose policy outputs are replayed. The record's
+    `problem` says why the script did not reach its end. The robots' log messages are hidden, except
+    errors.
 
-    Raises BundleError, ValueError for pads that find no room and for what whole robots cannot do,
-    OSError for a folder that cannot be written, RecordingError, and PartError if a policy or a
-    sensor raises anything.
+    Raises BundleError, ValueError for too little room for the pads and for fields that whole robots
+    do not support, OSError for a folder that cannot be written, RecordingError, and PartError if a
+    policy or a sensor raises an error.
     """
-    # What ten robots say to their own logs is nothing for a person.
+    # The log messages of ten robots would drown the output.
     with errors_only():
         return _fly(scenario, Path(folder).resolve(), Path(bundle), say, watch, logs, recorded)
 
@@ -63,8 +63,8 @@ def _fly(
     recorded: Path | None,
 ) -> FlightRecord:
     earlier = set(folder.rglob("*.mcap"))
-    # Logs of several flights, read together, must be of different times, and those of the same
-    # flight, flown again, of the same.
+    # Different flights need different times, so that their logs can be read together; the same
+    # flight, flown again, gets the same time.
     beginning = zlib.crc32(repr((scenario, load_bundle(bundle).id)).encode()) % _BEGINNINGS
     fleet = SimulatedFleet(
         scenario,
@@ -121,12 +121,12 @@ def _moment(fleet: SimulatedFleet, flight: ScriptedFlight) -> FleetMoment:
 
 
 class _Notes:
-    """Statuses of each robot, as its own log would have them."""
+    """Statuses of each robot, as its own log has them."""
 
     def __init__(self, fleet: SimulatedFleet) -> None:
         self._fleet = fleet
         self._said: dict[tuple[int, int, int], RobotStatus] = {}
-        # More often than a robot says something.
+        # More often than a robot publishes its status.
         fleet.schedule.every(SNAPSHOT_PERIOD_S, self._look)
 
     def _look(self) -> None:

@@ -1,4 +1,4 @@
-"""One flight of a fleet by the script."""
+"""One scripted flight of a fleet of programs, in real time."""
 
 import math
 import os
@@ -35,9 +35,9 @@ from lpac.sim.sitl.ground_station import RealVehicles
 
 @dataclass(frozen=True, slots=True)
 class FleetMoment:
-    """A fleet at one time, s from the script's start; `statuses` are by robot.
+    """State of a fleet at `time_s` since the script's start; `statuses` are by robot id.
 
-    `stop` ends the mission: all return, and land. Before the takeoff it ends the script.
+    `stop` ends the mission: all return and land. Before takeoff it ends the script.
     """
 
     time_s: float
@@ -53,9 +53,9 @@ def fly_programs(
 ) -> FlightRecord:
     """Run a fleet and its ground, and fly the script; `watch` is called several times a second.
 
-    Ctrl-C lands all, and so do a vehicle that ends, and a machine that does not keep up. Raises
-    FleetError if a robot's program ends before all are heard; OSError, LinkError, GroundError or
-    VehicleError if something cannot start.
+    Ctrl-C, the end of a vehicle, or an overloaded machine lands all. Raises SimulatedFleetError if
+    a robot's program ends before all are connected; OSError, LinkError, GroundError or VehicleError
+    if a part cannot start.
     """
     scenario, moments = fleet.layout.scenario, dict[str, _Moment]()
     flying_by_hand: list[Pilot] = []
@@ -119,13 +119,13 @@ def fly_programs(
             problem = "stopped by Ctrl-C"
         moments["end"] = _Moment.of(fleet, ground)
         lateness = fleet.lateness()
-    # The vehicles' own logs are whole once they have ended.
+    # PX4's logs are complete only after its end.
     return _record(fleet, flight, moments, problem, lateness, overloaded)
 
 
 @contextmanager
 def _in_sight(fleet: Fleet) -> Iterator[SimulatedVehicles | RealVehicles]:
-    """Its vehicles, as pilots see and fly them."""
+    """The vehicles, as pilots see and fly them."""
     if fleet.simulated is not None:
         yield fleet.simulated
         return
@@ -166,7 +166,7 @@ def _record(
     start_s = moments["assemble"].time_s if "assemble" in moments else moments["end"].time_s
     began_s = {name: at_s - start_s for name, at_s in flight.began_s.items()}
     began_s["end"] = moments["end"].time_s - start_s
-    # The mission's own figures; of the whole flight where there was none.
+    # Figures are of the mission, or of the whole flight without one.
     first = moments.get("mission", next(iter(moments.values())))
     last = moments.get("return", moments["end"])
     unix_s = time.time() - time.monotonic()
@@ -203,7 +203,7 @@ def _record(
 
 
 class RobotUsage(NamedTuple):
-    """CPU share and memory of one robot's program, and the logs that it left."""
+    """CPU share, memory and logs of one robot's program."""
 
     cpu_share: float = 0.0
     peak_memory_mb: float = 0.0
@@ -220,10 +220,10 @@ def flight_of(
     truth_in: Path | None,
     script: ScriptRecord,
 ) -> FlightRecord:
-    """The flight that `logs` and the vehicles' `tracks` tell of, and what is known of its `script`.
+    """Record of a flight, from its logs, the vehicles' `tracks` and its `script`.
 
-    That began at `start_s` of the tracks' clock, of which 0 is `unix_s`. The truth is left in
-    `truth_in`, beside logs of robots that are kept, for `lpac report`.
+    The script began at `start_s` on the tracks' clock, which is 0 at Unix time `unix_s`. The truth
+    is written to the folder `truth_in`, if given, for `lpac report`.
     """
     manifest = layout.bundle.manifest
     assert manifest.perception is not None and layout.features is not None

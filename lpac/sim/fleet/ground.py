@@ -1,4 +1,4 @@
-"""`lpac ground` as a program beside the simulator, just as an operator runs it."""
+"""`lpac ground` as a process, as an operator runs it."""
 
 import signal
 import time
@@ -17,9 +17,9 @@ _TRY_AGAIN_S = 0.05
 
 
 class GroundProgram(LpacProgram):
-    """One `lpac ground`; a context, in which it runs. `told` is what it tells its clients.
+    """One `lpac ground`; a context, in which it runs. `told` subscribes to its reports.
 
-    What it prints is in ground.log beside the fleet's file.
+    Its output goes to ground.log next to the fleet's file.
     """
 
     def __init__(self, fleet_toml: Path, fleet: str, name: str = "sim") -> None:
@@ -32,7 +32,7 @@ class GroundProgram(LpacProgram):
         self._told: GroundSubscriber | None = None
 
     def __enter__(self) -> Self:
-        """Comes back once it tells of the fleet. Raises GroundError if it does not start."""
+        """Start it, and wait for its first report. Raises GroundError if it does not start."""
         try:
             self.start()
         except BaseException:
@@ -45,35 +45,35 @@ class GroundProgram(LpacProgram):
 
     @property
     def told(self) -> GroundSubscriber:
-        """Subscriber to the ground, as long as it runs."""
+        """Subscriber to the ground station, while it runs."""
         assert self._told is not None
         return self._told
 
     def command(
         self, request: Request, meanwhile: Callable[[], None] = lambda: None
     ) -> CommandReport:
-        """Have a command done, and wait for what came of it; `meanwhile` is called once a second.
+        """Send a command and wait for its report; `meanwhile` is called once a second.
 
         Raises GroundError.
         """
         return command(self.fleet, request, meanwhile=meanwhile)
 
     def start(self) -> None:
-        """Start it, also again, on what it left on its disk. Raises GroundError if it does not."""
+        """Start or restart it, with the state left on disk. Raises GroundError if it fails."""
         super().start()
         self._listen()
 
     def suspend(self) -> None:
-        """It stands still, like a laptop that sleeps."""
+        """Stop the process, like a sleeping laptop."""
         self.send_signal(signal.SIGSTOP)
 
     def wake(self) -> None:
-        """It goes on. Raises GroundError if it tells nothing then."""
+        """Continue the process. Raises GroundError if it does not answer."""
         self.send_signal(signal.SIGCONT)
         self._listen()
 
     def _listen(self) -> None:
-        """Start anew, since listeners give a silent ground up."""
+        """Connect again, since subscribers give up a silent ground station."""
         told = self._connected()
         if self._told is not None:
             self._told.__exit__(None, None, None)
@@ -85,7 +85,7 @@ class GroundProgram(LpacProgram):
             try:
                 return GroundSubscriber(self.fleet).__enter__()
             except GroundError:
-                # It is not open yet, and nothing tells when it is.
+                # The socket does not exist yet, and nothing signals when it does.
                 if not self.running or time.monotonic() > until_s:
                     text = f"`lpac ground` does not start: {self.last_words()}"
                     raise GroundError(text) from None
@@ -98,7 +98,7 @@ class GroundProgram(LpacProgram):
             self.terminate()
             if self.wait(_END_WITHIN_S) is None:
                 self.kill()
-        # Nobody flies this fleet again: what a ground leaves for the next one is not needed.
+        # The fleet is not flown again, so the state for a restart is not needed.
         path = socket_path(self.fleet)
         for left in (path, path.with_suffix(".state"), path.with_suffix(".world")):
             left.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Keys for a fleet of programs on this machine, made on the fly."""
+"""Keys for a simulated fleet of programs."""
 
 import shutil
 from pathlib import Path
@@ -11,9 +11,9 @@ OPERATOR = "sim"
 
 
 def write_keys(folder: Path, fleet: str, robots: int) -> Path:
-    """A new authority with its operator in `folder`/keys, and each robot's beside its robot.toml.
+    """Make an authority and its operator in `folder`/keys, and each robot's keys in its folder.
 
-    Returns the folder of an observer that the simulator itself listens as. Raises OSError.
+    Returns the folder of the observer as which the simulator subscribes. Raises OSError.
     """
     keys, listener = folder / "keys", folder / "listener"
     shutil.rmtree(keys, ignore_errors=True)  # an earlier flight's
@@ -28,6 +28,6 @@ def write_keys(folder: Path, fleet: str, robots: int) -> Path:
 
 
 def give_list(authority: Authority, *identities: Path) -> None:
-    """Write the list as it is now to the members' folders, as `lpac fleet up` does by SSH."""
+    """Write the current member list to the members' folders, as `lpac fleet up` does by SSH."""
     for identity in identities:
         write_file(identity / MEMBERS, authority.members.text.encode(), 0o600)

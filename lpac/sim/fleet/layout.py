@@ -1,4 +1,4 @@
-"""Layout of a simulated fleet before it runs: its world and field, and where its robots stand."""
+"""Layout of a simulated fleet: its world, field and fence, and the robots' pads."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,16 +28,16 @@ MAX_ROBOTS = 30
 # Further keys of robot.toml, by table.
 Settings = Mapping[str, Mapping[str, object]]
 
-# The field is the policy's world; its y axis does not point north, so that mistakes show.
+# The field is the policy's world; its y axis does not point north, so that frame errors show.
 WORLD = WorldOrigin()
 ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
 
-# As far inside the field as there is room: what a robot takes its place to be walks.
+# As far inside the field as there is room, since position estimates drift.
 _PADS_INSIDE_FIELD_M = (2.0, 1.0, 0.0)
-# How often pads are drawn anew, and pushed apart, before there is no room for them.
+# Number of draws, and of pushes apart after each, before giving up.
 _PAD_DRAWS = 30
 _PAD_PUSHES = 300
-# What rounding and the last push may leave.
+# Tolerance for rounding and the last push.
 _PAD_SLACK = 1e-3
 
 
@@ -54,13 +54,13 @@ def settings_of(scenario: Scenario) -> Settings:
             "max_message_age_s": scenario.max_message_age_s,
             "max_input_age_s": scenario.input_age_s,
         },
-        # PX4 obeys no other remote control.
+        # PX4 obeys the remote control only with this setting.
         "failsafe": {"rc": "pilot"} if scenario.failures else {},
     }
 
 
 def require_whole_robots(scenario: Scenario) -> None:
-    """Raise ValueError for what whole robots cannot do."""
+    """Raise ValueError that names a field whole robots do not support."""
     scenario.require_default(
         "whole robots", "controller", "scale", "max_speed_m_s", "position_bias",
         "position_error_m", "lag_s", "payload", "radio",
@@ -70,25 +70,27 @@ def require_whole_robots(scenario: Scenario) -> None:
     if scenario.clocks.synchronous:
         raise ValueError("synchronous = True: must be False for whole robots")
     if scenario.wind_m_s is not None and not scenario.errors:
-        raise ValueError(f"wind_m_s = {scenario.wind_m_s}: there is none without errors")
+        raise ValueError(f"wind_m_s = {scenario.wind_m_s}: must be left out without errors")
     for failure in scenario.failures:
         if not math.isfinite(failure.until_s):
-            raise ValueError(f"robot {failure.robot} is lost: whole robots can only be away")
+            raise ValueError(
+                f"failures: robot {failure.robot} has no until_s: whole robots must come back"
+            )
 
 
 class Layout:
-    """A fleet's world, field, fence and pads, all of which follow from its scenario.
+    """A fleet's world, field, fence and pads, all derived from its scenario.
 
-    `pads_m` (N, 2) is where the robots really stand, `landing_points_m` (N, 2) where they return
-    to, both in the mission frame. `vehicles` are simulated ones on those pads; none are drawn with
-    `without_vehicles`, for real ones that know where they are.
+    `pads_m` (N, 2) are the true pads, `landing_points_m` (N, 2) the points to which robots return,
+    both in the mission frame. `vehicles` are simulated ones on those pads; `without_vehicles`
+    leaves them out, for real PX4s without position errors.
     """
 
     def __init__(
         self, scenario: Scenario, bundle_path: Path, *, without_vehicles: bool = False
     ) -> None:
-        """Raises ValueError if there is no room for so many robots; BundleError for a bundle that
-        cannot be loaded, or has no perception."""
+        """Raise ValueError if there is too little room for the robots; BundleError for a bundle
+        that cannot be loaded, or has no perception."""
         require_whole_robots(scenario)
         self.bundle, self.bundle_path = load_bundle(bundle_path), bundle_path.resolve()
         manifest, perception = self.bundle.manifest, scenario.perception_of(self.bundle)
@@ -121,22 +123,22 @@ class Layout:
             self.pads_m, self.landing_points_m, self.vehicles = self._draw_vehicles()
 
     def mission_track(self, track: TrueTrack) -> TrueTrack:
-        """One in the world's frame, as a record has it."""
+        """Convert a track from the world frame to the mission frame."""
         rotation, origin_m = self.to_mission.rotation, self.to_mission.local_origin_m
         position_m = track.position_m @ rotation.T + origin_m
-        # The world's ground is at down = 0, whatever height the frame's origin has; no -0.0.
+        # The ground is at down = 0 at any height of the frame's origin; subtract to avoid -0.0.
         position_m[:, 2] = 0.0 - track.position_m[:, 2]
         velocity_m_s = track.velocity_m_s @ rotation.T
         return replace(track, position_m=position_m, velocity_m_s=velocity_m_s)
 
     def to_world_m(self, place_m: F64) -> tuple[float, float]:
-        """North and east, m, of a place (2,) of the mission frame."""
+        """North and east, m, of a position (2,) in the mission frame."""
         north_m, east_m, _ = self.to_mission.mission_to_local(np.array([*place_m, 0.0])).tolist()
         return north_m, east_m
 
     def way_out(self, position_ned_m: F64) -> tuple[F64, float]:
-        """From there: the direction (2,), north and east, of the fence's nearest line, and how far
-        inside it that is, m."""
+        """Direction (2,), north and east, to the fence's nearest line, and the distance inside
+        it, m."""
         place_m = self.to_mission.local_to_mission(position_ned_m)[:2]
         edges = self.fence.edges()
         out = -edges.inward[int(np.argmin(edges.distances_m(place_m)))]
@@ -156,13 +158,13 @@ class Layout:
     ) -> None:
         """fleet.toml, world.env, and robots/<i>/robot.toml in `folder`.
 
-        If the scenario's world or range differs from the bundle's, robots get a bundle of their
-        own there, which is where they read both.
+        If the scenario's world size or range differs from the bundle's, a bundle with these sizes
+        is written to `folder` for the robots.
 
-        `robots` has what fleet.toml says of each robot besides its ids, by name, in their order.
-        `settings` are further keys of robot.toml's tables, for all robots. The last `spares` lose
-        their slots in fleet.toml, once their robot.toml is written. `keys`: a secure fleet has them
-        in `folder`, where `write_keys` puts them. `radio` is fleet.toml's table of that name.
+        `robots` has the entries of each robot in fleet.toml besides its ids, by name, in order.
+        `settings` are further keys of robot.toml's tables, for all robots. The last `spares` have
+        no slot in fleet.toml, but a robot.toml. `keys`: keys of a secure fleet are in `folder`, as
+        written by `write_keys`. `radio` is fleet.toml's table of that name.
         """
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "world.env").write_text(format_world(self.features))
@@ -185,7 +187,7 @@ class Layout:
                 "bundle": str(self.bundle_path),
                 "world": "world.env",
                 "robot": robot,
-                # No computer has such a host name, so that nobody deploys to this machine.
+                # A host name that never resolves keeps deployments off this machine.
                 "robots": {
                     name: {
                         "host": f"{name}.invalid",
@@ -219,10 +221,10 @@ class Layout:
         return [round(c, 3) for c in self.landing_points_m[robot].tolist()]
 
     def _draw_vehicles(self) -> tuple[F64, F64, tuple[Px4Vehicle, ...]]:
-        """Pads, landing points, vehicles. A robot lands where it takes its own pad to be."""
+        """Pads, landing points and vehicles. A robot lands at its own estimate of its pad."""
         robots = self.scenario.robots
         seeds = np.random.SeedSequence([self.scenario.seed, robots]).generate_state(robots).tolist()
-        # Both places of a vehicle and its pad: a vehicle's bias is drawn before it has a place.
+        # A vehicle's bias is needed before its pad, so it is drawn twice from the same seed.
         biases_m = np.zeros((robots, 2))
         if self.scenario.errors:
             drawn_m = [np.array(Px4Vehicle(seed=seed).gps_bias_m) for seed in seeds]
@@ -238,7 +240,7 @@ class Layout:
             )  # fmt: skip
             if not self.scenario.errors:
                 vehicle.gps_bias_m = ZERO
-                # Half of the position error at worst, as a receiver with corrections tells.
+                # At most half of the position error, as a receiver with corrections reports.
                 vehicle.gps_told_m = min(GPS_ACCURACY_M[0], self.scenario.budget.gps_m / 2.0)
             vehicles.append(vehicle)
         return pads_m, pads_m + biases_m, tuple(vehicles)
@@ -248,7 +250,7 @@ class Layout:
         return Errors(seed, scenario.seed, scenario.wind_m_s) if scenario.errors else None
 
     def _draw_pads(self, biases_m: F64) -> F64:
-        """Pads (N, 2) apart from each other, in truth and as robots with each (N, 2) see them."""
+        """Pads (N, 2) apart from each other, in truth and with each of the biases (N, 2) added."""
         if self.scenario.starts_m is not None:
             return np.array(self.scenario.starts_m)
         rng = np.random.default_rng([self.scenario.seed, 1])
@@ -267,16 +269,16 @@ class Layout:
         )
 
     def _horizontal(self, vector_m: F64) -> F64:
-        """A vector (3,) of the world, along the mission axes: (2,)."""
+        """Horizontal part (2,) in mission axes of a world vector (3,)."""
         turned: F64 = self.to_mission.velocity_to_mission(vector_m)[:2]
         return turned
 
 
 def pads_for_all(scenarios: Sequence[Scenario], bundle: Path, spare_m: float = 0.0) -> F64:
-    """Pads (N, 2) on which the robots of each scenario may stand, within `spare_m`.
+    """Pads (N, 2) that suit all scenarios, with a tolerance of `spare_m`.
 
-    They are apart in truth, and as the receivers of each scenario see them; scenarios have the same
-    numbers of robots, and the same budget. Raises ValueError if there is no room, BundleError.
+    They are apart in truth, and by the receivers of each scenario; all scenarios have the same
+    number of robots and the same budget. Raises ValueError if there is no room, BundleError.
     """
     nowhere_m = tuple((0.0, 0.0) for _ in range(scenarios[0].robots))
     layouts = [Layout(replace(scenario, starts_m=nowhere_m), bundle) for scenario in scenarios]
@@ -289,8 +291,8 @@ def pads_for_all(scenarios: Sequence[Scenario], bundle: Path, spare_m: float = 0
     )
     if pads_m is None:
         raise ValueError(
-            f"no pads on {field_m:g} x {field_m:g} m were found that are {apart_m:g} m apart for "
-            f"all that receivers err by in {len(scenarios)} trials: fly fewer"
+            f"no pads on {field_m:g} x {field_m:g} m are {apart_m:g} m apart for the receiver "
+            f"errors of all {len(scenarios)} trials: fly fewer"
         )
     return pads_m
 
@@ -298,7 +300,7 @@ def pads_for_all(scenarios: Sequence[Scenario], bundle: Path, spare_m: float = 0
 def _pads_within(
     biases_m: F64, field_m: float, apart_m: float, rng: np.random.Generator
 ) -> F64 | None:
-    """As far inside the field as there is room; see `_pads_apart`."""
+    """Pads as far inside the field as there is room; see `_pads_apart`."""
     for inside_m in _PADS_INSIDE_FIELD_M:
         pads_m = _pads_apart(biases_m, inside_m, field_m - inside_m, apart_m, rng)
         if pads_m is not None:
@@ -309,7 +311,7 @@ def _pads_within(
 def _pads_apart(
     biases_m: F64, low_m: float, high_m: float, apart_m: float, rng: np.random.Generator
 ) -> F64 | None:
-    """RobotPaths (N, 2) within a square, `apart_m` from each other, and so with each of `biases_m`
+    """Pads (N, 2) within a square, `apart_m` from each other, also with each of `biases_m`
     (B, N, 2) added.
 
     Drawn in the cells of a grid, then pushed apart; None if they find no room.
@@ -329,12 +331,12 @@ def _pads_apart(
             places_m = np.clip(places_m, lowest_m, highest_m)
             all_m = truth_and_seen_m + places_m
             offsets_m = all_m[:, :, None] - all_m[:, None]
-            # Several times as fast as a norm along an axis of two.
+            # Several times as fast as np.linalg.norm on an axis of length 2.
             distances_m = np.sqrt(offsets_m[..., 0] ** 2 + offsets_m[..., 1] ** 2)
             distances_m[:, itself, itself] = math.inf
             if distances_m.min() >= apart_m * (1.0 + _PAD_SLACK / 2.0):
                 return places_m
             shares = np.maximum(wanted_m - distances_m, 0.0) / np.maximum(distances_m, 1e-9)
-            # By one bias less than half of what is missing for either of two: crowds come to rest.
+            # A bit less than half of the missing distance for each of two, so that crowds converge.
             places_m = places_m + 0.35 * (offsets_m * shares[..., None]).sum(axis=(0, 2))
     return None

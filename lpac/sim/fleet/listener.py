@@ -1,4 +1,4 @@
-"""Listener to the statuses of a fleet's robots on the radio."""
+"""Subscriber to the statuses of a fleet's robots."""
 
 import threading
 import time
@@ -21,16 +21,16 @@ Say = Callable[[str], None]
 
 
 class Heard(NamedTuple):
-    """A status, and the `time.monotonic()` when it came."""
+    """A status, and the `time.monotonic()` of its arrival."""
 
     at_s: float
     status: RobotStatus
 
 
 class FleetListener:
-    """Keeps every status of every robot, whoever commands them; a context. It says nothing.
+    """Receive-only subscriber that keeps every status of every robot; a context.
 
-    Every method may be called from any thread.
+    All methods are thread-safe.
     """
 
     def __init__(
@@ -41,8 +41,8 @@ class FleetListener:
         identity: Path | None = None,
         say: Say = lambda _: None,
     ) -> None:
-        """`connect` are the robots' endpoints; `identity` is the folder of its own, where they have
-        one; `say` is told what cannot be understood, from another thread.
+        """`connect` are the robots' endpoints; `identity` is the folder with its own keys, in a
+        secure fleet; `say` gets malformed messages, from another thread.
         """
         self._fleet = fleet
         self._identity = identity
@@ -53,7 +53,7 @@ class FleetListener:
         self._link: ZenohLink | None = None
 
     def __enter__(self) -> Self:
-        """Raises LinkError."""
+        """Subscribe. Raises LinkError."""
         guard: Guard = Unguarded(0)
         tls, scheme = None, "tcp"
         if self._identity is not None:
@@ -73,32 +73,32 @@ class FleetListener:
         self._link.close()
 
     def statuses(self) -> dict[int, RobotStatus]:
-        """The newest status of each robot that is heard, by robot id."""
+        """The newest status of each robot with a fresh one, by robot id."""
         earliest_s = time.monotonic() - FRESH_S
         with self._changed:
             newest = {robot: heard[-1] for robot, heard in self._heard.items()}
         return {robot: heard.status for robot, heard in newest.items() if heard.at_s >= earliest_s}
 
     def history(self, robot: int) -> tuple[Heard, ...]:
-        """Everything that a robot has said of itself, in order."""
+        """All statuses of a robot, in order."""
         with self._changed:
             return tuple(self._heard.get(robot, ()))
 
     def forget(self) -> None:
-        """Keep of each robot only what it said last."""
+        """Keep only the last status of each robot."""
         with self._changed:
             for heard in self._heard.values():
                 del heard[:-1]
 
     def wait_for(self, condition: Callable[[Statuses], bool], timeout_s: float) -> bool:
-        """Wait until `condition` holds of the statuses; False if that took too long."""
+        """Wait until `condition` holds; False on timeout."""
         deadline_s = time.monotonic() + timeout_s
         while not condition(self.statuses()):
             left_s = deadline_s - time.monotonic()
             if left_s <= 0.0:
                 return False
             with self._changed:
-                # Who falls silent changes nothing here, so look again.
+                # A robot that falls silent sends no notification, so look again.
                 self._changed.wait(min(left_s, _LOOK_AGAIN_S))
         return True
 

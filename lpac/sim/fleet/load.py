@@ -1,6 +1,6 @@
-"""How many robots this machine carries: found out within seconds, by work like theirs.
+"""Measurement of how many robots this machine can run in real time.
 
-As a program, `python -m lpac.sim.fleet.load BUNDLE` is one of the workers that measure.
+`python -m lpac.sim.fleet.load BUNDLE` is one of its worker processes.
 """
 
 import json
@@ -18,12 +18,11 @@ from lpac.sim.points import fly_points
 from lpac.sim.programs import python_program
 from lpac.sim.scenario import Scenario
 
-# A robot's program takes as much of a processor, with its vehicle, as so many units of work a
-# second. A core does 27 a second; a PX4 takes 0.1 to 0.2 of one, and a robot's program beside it
-# 0.05 to 0.14: two cores carry three of them.
+# Units of work per second that a robot's program and its vehicle take. A core does 27 a second; a
+# PX4 takes 0.1 to 0.2 of a core, and a robot's program 0.05 to 0.14 besides: two cores run three.
 _UNITS_PER_S = {"mavlink": 3.0, "px4": 8.0}
 
-# The rest is for what comes at once: programs that start, and what else the machine does.
+# The rest is for bursts: programs that start, and other load.
 _SHARE_TO_USE = 0.55
 _ROUNDS = 5
 _ROUND_S = 0.4
@@ -33,9 +32,9 @@ _UNIT = Scenario(robots=2, duration_s=2.0)
 
 
 def robots_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> float:
-    """How many robots fly on this machine without falling behind, beside what runs on it now.
+    """Number of robots that this machine can fly in real time, under its present load.
 
-    Works for two seconds on every core that this process may use.
+    The measurement loads every core that this process may use for two seconds.
 
     Raises OSError or BundleError for a bundle that cannot be loaded.
     """
@@ -44,7 +43,7 @@ def robots_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> float:
 
 
 def _units_per_s(bundle: Path) -> float:
-    """Speed of all cores together; the median of rounds, so that a moment's load does not count."""
+    """Speed of all cores together, as the median of rounds, to ignore short bursts of load."""
     with ExitStack() as stack:
         workers = [
             stack.enter_context(
@@ -66,7 +65,7 @@ def _units_per_s(bundle: Path) -> float:
 
 
 def _work(bundle_path: Path) -> None:
-    """Say when ready, wait for the end of stdin, and say the units a second of each round."""
+    """Print a line when ready, wait for the end of stdin, then print each round's units/s."""
     bundle = load_bundle(bundle_path)
     fly_points(_UNIT, bundle)
     sys.stdout.write("ready\n")

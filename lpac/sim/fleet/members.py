@@ -1,4 +1,4 @@
-"""The members of a simulated fleet: one list in memory, which all have."""
+"""Member list of a simulated fleet, shared in memory."""
 
 import hashlib
 from collections.abc import Callable
@@ -10,12 +10,15 @@ from edge.identity.signature import Signer
 
 
 class SimulatedMembers:
-    """Keys follow from names, so that flights can be repeated; every guard has `list` at once."""
+    """Members with keys derived from their names, so that flights repeat.
+
+    Every guard gets a changed `list` at once.
+    """
 
     def __init__(self, fleet: str) -> None:
         self._fleet = fleet
         self.list = Members(fleet, 1, self._signer("authority").public_key)
-        # All that ever did: whoever is revoked does not come back by starting again.
+        # Includes revoked members, which must not rejoin by a restart.
         self._joined: list[Member] = []
         self._guards: list[SignedGuard] = []
 
@@ -27,7 +30,7 @@ class SimulatedMembers:
         start: int,
         clock_s: Callable[[], float],
     ) -> SignedGuard:
-        """Guard of one start of a member's program, which joins if it is new; its key stays."""
+        """Guard for one start of a member's program; a new member joins the list."""
         signer = self._signer(f"{role} {name}")
         own = Member(role, name, robot_id, signer.public_key)
         if own not in self._joined:
@@ -38,7 +41,7 @@ class SimulatedMembers:
         return guard
 
     def revoke(self, role: Role, name: str) -> None:
-        """Take that member off the list."""
+        """Remove a member from the list."""
         key = self._signer(f"{role} {name}").public_key
         self._change(tuple(m for m in self.list.members if m.public_key != key))
 

@@ -1,4 +1,4 @@
-"""A pilot who takes a robot of a simulated fleet out of the field, and brings it back."""
+"""Simulated pilot who flies a robot out of the field and back."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -14,15 +14,15 @@ from lpac.sim.px4.modes import Px4Mode
 
 LOOKS_S = 0.1
 _GAIN_PER_S, _FASTEST_M_S = 0.8, 3.0
-# Beyond the fence's line; when the pilot turns back, and lets the sticks go, before the end.
+# Distance beyond the fence; times before the end at which the pilot turns back, and lets go.
 _BEYOND_M = 2.0
 _BACK_S, _LETS_GO_S = 9.0, 1.0
 
 
 class PilotedVehicle(Protocol):
-    """A pilot's view of a vehicle, and its remote control: `Px4Vehicle`, or a PX4.
+    """A pilot's view of a vehicle and its remote control: `Px4Vehicle`, or a real PX4.
 
-    `position_m` (3,) is where it really is, `rc_connected` whether the remote control is heard.
+    `position_m` (3,) is its true position, `rc_connected` whether the remote control is received.
     """
 
     position_m: F64
@@ -30,17 +30,17 @@ class PilotedVehicle(Protocol):
     rc_connected: bool
 
     def pilot(self, mode: Px4Mode = ..., stick_velocity_m_s: Sequence[float] = ()) -> Any:
-        """The remote control is on, its switch on that mode, and its sticks are held so."""
+        """Switch the remote control on, with this mode and these sticks."""
 
     def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
-        """North, east, down; empty means centred."""
+        """Hold the sticks for a velocity: north, east, down, m/s; empty means centred."""
 
     def set_mode(self, mode: Px4Mode) -> Any:
-        """Ask for a mode."""
+        """Command a mode."""
 
 
 def perturbations(failures: Sequence[Failure]) -> tuple[Perturbation, ...]:
-    """Orders of the ground: pilots are given the robots, and they are taken back."""
+    """Commands of the ground station that give robots to pilots, and take them back."""
     return tuple(
         each
         for failure in failures
@@ -52,11 +52,9 @@ def perturbations(failures: Sequence[Failure]) -> tuple[Perturbation, ...]:
 
 
 class Pilot:
-    """Fly a robot out of the fence by its sticks while it is away, and back to about where it was.
+    """Pilot who flies a robot out of the fence and back to about where it was, at its height.
 
-    It keeps its height.
-
-    `mission_began_s` is by the clock that `look` is told the time of.
+    `mission_began_s` is on the clock of `look`.
     """
 
     def __init__(
@@ -72,9 +70,9 @@ class Pilot:
         self._over = False
 
     def look(self, now_s: float, said: RobotStatus | None) -> None:
-        """Some times a second; `said` is what the robot says of itself, None if nothing.
+        """Act; to be called several times a second with the robot's last status, if any.
 
-        The pilot takes it once it says that it is the pilot's.
+        The pilot takes over once the status says PILOT.
         """
         if self._over or now_s < self._from_s:
             return

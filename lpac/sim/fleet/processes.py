@@ -1,4 +1,4 @@
-"""A whole fleet on this machine: vehicles, one `lpac robot run` process each, and who listens."""
+"""A fleet of processes: vehicles, one `lpac robot run` for each, and a status subscriber."""
 
 import math
 import os
@@ -23,8 +23,8 @@ from lpac.sim.scenario import Scenario
 from lpac.sim.sitl.build import Px4Build
 
 STOP_WITHIN_S = 3.0
-# Once a machine fell so far behind real time within a while, what robots say of themselves follows
-# from that; and then a flight is over.
+# Lateness, s, within `_WHILE_S`, beyond which the robots' reports follow from the overload, and
+# beyond which the flight ends.
 DOUBTFUL_S = 1.5
 OVERLOADED_S = 5.0
 _WHILE_S = 20.0
@@ -32,14 +32,14 @@ _LOOK_AGAIN_S = 0.05
 
 
 class SimulatedFleetError(ValueError):
-    """A robot's program has ended; the text says which, and its last words."""
+    """A robot's program has ended; the text says which, and how."""
 
 
 class Backlog(NamedTuple):
     """How far a machine is behind real time, s.
 
-    `vehicles_s` is what the vehicles fell behind, `robots_s` the time of the control ticks that a
-    robot has left out, the median of all robots.
+    `vehicles_s` is the vehicles' lateness, `robots_s` the time of the control ticks that the median
+    robot has skipped.
     """
 
     vehicles_s: float
@@ -49,12 +49,12 @@ class Backlog(NamedTuple):
 class OverloadError(RuntimeError):
     """This machine does not keep up; the text says how far it is behind, and what to do.
 
-    `carried` is how many robots it was found to carry, None if nobody looked.
+    `carried` is how many robots it can run; None if not measured.
     """
 
     def __init__(self, lateness: Backlog, robots: int, carried: int | None = None) -> None:
         fewer = robots // 2 if carried is None else max(1, min(robots - 1, carried))
-        advice = f"fly fewer: -n {fewer}" if robots > 1 else "end what else runs on it"
+        advice = f"fly fewer: -n {fewer}" if robots > 1 else "end other programs on it"
         super().__init__(
             f"this machine does not keep up with {counted(robots, 'robot')}: within {_WHILE_S:g} s "
             f"the vehicles fell {lateness.vehicles_s:.1f} s behind real time, the robots left out "
@@ -63,16 +63,16 @@ class OverloadError(RuntimeError):
 
 
 class Usage(NamedTuple):
-    """Resources of a process so far: processor time, s, and its greatest resident memory, MB."""
+    """Resources of a process so far: CPU time, s, and peak resident memory, MB."""
 
     cpu_s: float
     peak_memory_mb: float
 
 
 class RobotProcess(LpacProgram):
-    """One `lpac robot run`; `folder` holds robot.toml, what it prints (robot.log), its flight log.
+    """One `lpac robot run`; `folder` holds robot.toml, robot.log (its output) and flight logs.
 
-    `name` is what people call the robot.
+    `name` is the robot's name in commands.
     """
 
     def __init__(self, robot_id: int, folder: Path) -> None:
@@ -85,24 +85,24 @@ class RobotProcess(LpacProgram):
         self._first_start_unix_s = math.inf
 
     def start(self) -> None:
-        """Start the program, also again after it has ended."""
+        """Start the program, or restart it after it has ended."""
         if not math.isfinite(self._first_start_unix_s):
             self._first_start_unix_s = time.time()
             self.log.unlink(missing_ok=True)
         super().start()
 
     def kill_watchdog(self) -> None:
-        """The process that watches it, its only child, ends like kill -9."""
+        """Kill the watchdog, the program's only child (kill -9)."""
         for children in Path(f"/proc/{self.pid}/task").glob("*/children"):
             for child in children.read_text().split():
                 os.kill(int(child), signal.SIGKILL)
 
     def usage(self) -> Usage:
-        """Nothing if the program has ended."""
+        """Resources used so far; zero if the program has ended."""
         return process_usage(self.pid) if self.running else Usage(0.0, 0.0)
 
     def logs(self) -> list[Path]:
-        """The flight logs of these starts, the oldest first; the folder may have older ones."""
+        """Flight logs since the first start, oldest first, without older ones in the folder."""
         return sorted(
             path
             for path in (self.folder / "logs").rglob("*.mcap")
@@ -111,7 +111,7 @@ class RobotProcess(LpacProgram):
 
 
 def process_usage(pid: int) -> Usage:
-    """Measure a process of this machine so far."""
+    """Resources of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     ticks = int(fields[11]) + int(fields[12])
     status = Path(f"/proc/{pid}/status").read_text()
@@ -122,13 +122,12 @@ def process_usage(pid: int) -> Usage:
 
 
 class Fleet:
-    """Vehicles and robots: a context, in which all of them run. Nobody commands them.
+    """Vehicles and robots, without a ground station: a context, in which all of them run.
 
-    `layout` is what it is, `robots[i]` is robot i's process, `heard` what they say. `simulated` are
-    the vehicles themselves, for whoever wants to do something to them; None where they are real
-    PX4. `endpoints` are the robots' zenoh addresses, `name` the fleet's. `carried` is how many
-    robots this machine was found to carry; who finds it out says so. `fleet_toml` describes the
-    fleet to `lpac ground`, as if its robots were in the field.
+    `robots[i]` is robot i's process, `heard` has their statuses. `simulated` gives access to
+    simulated vehicles; None for real PX4s. `endpoints` are the robots' zenoh addresses, `name` is
+    the fleet's. `carried`, set by the caller, is how many robots this machine can run.
+    `fleet_toml` describes the fleet to `lpac ground`, as if its robots were in the field.
     """
 
     def __init__(
@@ -146,7 +145,7 @@ class Fleet:
         With `px4_build` the vehicles are real PX4s of that build folder. `settings` are further
         keys of robot.toml's tables, for all robots.
 
-        Raises ValueError if that one is no build, or there is no room for so many robots;
+        Raises ValueError if `px4_build` is no build, or there is too little room for the robots;
         BundleError for a bundle that cannot be loaded, or has no perception.
         """
         self.layout = Layout(scenario, bundle_path, without_vehicles=px4_build is not None)
@@ -164,7 +163,7 @@ class Fleet:
         self.endpoints = tuple(f"{scheme}/127.0.0.1:{port}" for port in ports)
         radio = {}
         if scenario.transport == "multicast":
-            # A group of its own: another fleet's datagrams would be looked at, too.
+            # A group of its own, so that it does not receive another fleet's datagrams.
             radio = {"transport": "multicast", "group": f"239.255.76.80:{group_port}"}
         self.name = f"sim-{ports[0]}"
         self.robots = tuple(
@@ -216,7 +215,7 @@ class Fleet:
         self._stack.close()
 
     def require_running(self) -> None:
-        """Raises FleetError if the program of a robot has ended."""
+        """Raise SimulatedFleetError if the program of a robot has ended."""
         for robot in self.robots:
             if not robot.running:
                 raise SimulatedFleetError(
@@ -224,17 +223,17 @@ class Fleet:
                 )
 
     def begin(self) -> None:
-        """All programs run: from now on this machine has to keep up."""
+        """Start to measure lateness, once all programs run."""
         self._late_before = self._lateness()
         self._latenesses = deque([(time.monotonic(), Backlog(0.0, 0.0))])
 
     def lateness(self) -> "Backlog":
-        """How far this machine fell behind since `begin`."""
+        """Lateness since `begin`."""
         now, before = self._lateness(), self._late_before
         return Backlog(now.vehicles_s - before.vehicles_s, now.robots_s - before.robots_s)
 
     def require_keeping_up(self) -> None:
-        """Raises OverloadError if this machine is too far behind."""
+        """Raise OverloadError if this machine is too far behind."""
         recent = self._recent_lateness()
         if max(recent) > OVERLOADED_S:
             raise OverloadError(recent, self.layout.scenario.robots, self.carried)
@@ -249,12 +248,12 @@ class Fleet:
         return Backlog(self.vehicles.lost_s(), float(np.median(left_out_s or [0.0])))
 
     def say_unless_behind(self, text: str) -> None:
-        """Say what robots do; nothing once it follows from a machine that is behind."""
+        """Report what robots do, unless it may follow from an overloaded machine."""
         if max(self._recent_lateness()) < DOUBTFUL_S:
             self._say(text)
 
     def _recent_lateness(self) -> "Backlog":
-        """How far this machine fell behind lately."""
+        """Lateness within the last `_WHILE_S`."""
         now_s, now = time.monotonic(), self.lateness()
         self._latenesses.append((now_s, now))
         while self._latenesses[0][0] < now_s - _WHILE_S:
@@ -263,7 +262,7 @@ class Fleet:
         return Backlog(now.vehicles_s - before.vehicles_s, now.robots_s - before.robots_s)
 
     def forget(self) -> None:
-        """Keep nothing of the past, which only grows, and which a flight's figures alone need."""
+        """Drop the history, which only the figures of a flight need."""
         self.heard.forget()
         self.vehicles.forget()
 

@@ -1,7 +1,7 @@
-"""Recorded decisions of policies in a simulated flight: the same flight on any CPU.
+"""Replay of recorded policy outputs, for the same simulated flight on any CPU.
 
-onnxruntime's numbers differ in the last bits from one type of CPU to another, and a flight then
-goes another way. Their flight logs hold what the robots' policies made of it.
+onnxruntime's results differ in the last bits between types of CPU, and the flights then diverge.
+The flight logs hold the policies' outputs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,11 +17,11 @@ from edge.policy.family import Observation, Perceived, Policy, PolicyStep
 
 
 class RecordingError(ValueError):
-    """The logs are not those of this flight; the text says which, and why."""
+    """The logs do not belong to this flight; the text says which, and why."""
 
 
 class RecordedAgent:
-    """One robot's agent, of which each step is as its log has it."""
+    """Agent that replays the steps of one robot's log."""
 
     def __init__(self, steps: "RecordedSteps", unix_s: Callable[[], float]) -> None:
         """`unix_s` is the simulated wall clock."""
@@ -29,25 +29,25 @@ class RecordedAgent:
         self._unix_s = unix_s
 
     def observe(self, observation: Observation) -> Perceived:
-        """Its steps need no features."""
+        """Returns no features: its steps need none."""
         return Perceived(np.zeros(0, np.float32), {})
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
-        """Decision at this time. Raises PartError if there was none."""
+        """Recorded step at this time. Raises PartError if there is none."""
         return self._steps.at(self._unix_s())
 
     def reset(self) -> None:
-        """It remembers nothing."""
+        """Do nothing: it has no memory."""
 
 
 class RecordedSteps:
-    """The steps of one robot in one flight, by their times."""
+    """Steps of one robot in one flight, by time, ms."""
 
     def __init__(self, steps: Mapping[int, PolicyStep]) -> None:
         self._steps = steps
 
     def at(self, unix_time_s: float) -> PolicyStep:
-        """Raises PartError if there was none."""
+        """Step at that Unix time. Raises PartError if there is none."""
         step = self._steps.get(_in_ms(unix_time_s))
         if step is None:
             raise PartError(
@@ -58,9 +58,9 @@ class RecordedSteps:
 
 
 def recorded_steps(folder: Path, robot_id: int, policy: Policy) -> RecordedSteps:
-    """Of a robot, from what a simulated flight left in its folder.
+    """Steps of a robot, from the folder of a simulated flight.
 
-    Raises RecordingError if there are no logs of one flight with this policy; OSError.
+    Raises RecordingError unless its logs are of one flight with this policy; OSError.
     """
     logs = sorted((folder / "robots" / str(robot_id)).rglob("*.mcap"))
     if not logs:
@@ -85,5 +85,5 @@ def recorded_steps(folder: Path, robot_id: int, policy: Policy) -> RecordedSteps
 
 
 def _in_ms(unix_time_s: float) -> int:
-    """No two steps of a policy are so near each other; a log keeps times far more exactly."""
+    """Time key of a step: steps are further apart, and a log's times far more exact."""
     return round(unix_time_s * 1e3)

@@ -1,7 +1,6 @@
-"""Whole robots on one clock, in one process: their real nodes, and simulated vehicles.
+"""Whole robots on one clock, in one process: the real nodes on simulated vehicles.
 
-Who has them gives them their links, and lets their time pass: `fleet.simulated` on a simulated
-clock.
+Subclasses provide the links and advance the time: `fleet.simulated` on a simulated clock.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,26 +32,26 @@ from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.scenario import Scenario
 from lpac.sim.schedule import Recurrence, Schedule, WallClock
 
-# Of a vehicle's physics, unless somebody is content with less.
+# Default step of the vehicles' physics.
 VEHICLE_STEP_S = 0.02
-# Of preflight and status.
+# Period of preflight and status.
 _CHORE_S = 0.25
 _WATCH_S = 0.1
 
 
 class OpenLink(Link, Protocol):
-    """A link that ends with its program."""
+    """A link that is closed with its program."""
 
     def close(self) -> None:
-        """Leave."""
+        """Close the link."""
         ...
 
 
 class SimulatedRobot:
-    """A vehicle, which is always there, and a robot's program, while that runs.
+    """A vehicle, and a robot's program, which may start and end.
 
-    `status` is what the program said of itself last, whoever heard it; None before it did. `clock`
-    is its computer's.
+    `status` is the program's last one, received or not; None before the first. `clock` is the
+    robot computer's.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class SimulatedRobot:
         next_boot: Callable[[], int],
         logs: bool,
     ) -> None:
-        """`world` is the text of its world file. `next_boot` numbers the starts of programs."""
+        """`world` is the text of the world file. `next_boot` numbers the starts of programs."""
         self.config = config
         self.vehicle = vehicle
         self.world = world
@@ -92,11 +91,11 @@ class SimulatedRobot:
 
     @property
     def status(self) -> RobotStatus | None:
-        """Its last status, also from before its program ended; None: none yet."""
+        """The last status, also after the program has ended; None before the first."""
         return (self.node and self.node.status) or self._said
 
     def start(self) -> None:
-        """Its program starts, or starts again."""
+        """Start or restart the program."""
         self.stop()
         schedule, boot = self._schedule, self._next_boot()
         if self._logs:
@@ -134,7 +133,7 @@ class SimulatedRobot:
             ("status", _CHORE_S, partial(node.status_step, {})),
         )
         self.loops = {
-            # Nobody starts ten programs at one time.
+            # Random phases, since real programs do not start at the same time.
             name: schedule.every(period_s, step, period_s * self._rng.random())
             for name, period_s, step in steps
         }
@@ -142,16 +141,16 @@ class SimulatedRobot:
             self.loops["log"] = schedule.every(_CHORE_S, self._log.flush)
 
     def hang(self, duration_s: float) -> None:
-        """All loops of its program stand still, and then go on."""
+        """Stop all loops of the program for this long."""
         for loop in self.loops.values():
             loop.hang(duration_s)
 
     def fill_disk(self) -> None:
-        """Nothing more can be written: its log says so, as `FlightLog` does."""
+        """Fill the disk: the log reports it, as `FlightLog` does."""
         self._disk.full = True
 
     def end(self) -> None:
-        """Its program is told to end, and leaves the vehicle as its configuration says."""
+        """End the program as by SIGTERM: it leaves the vehicle as on_stop says."""
         assert self.node is not None and self.watchdog is not None
         action = self.node.leave(Action(self.config.on_stop))
         if action is not None:
@@ -160,7 +159,7 @@ class SimulatedRobot:
         self.stop()
 
     def stop(self) -> None:
-        """Its program ends, as by a loss of power."""
+        """End the program, as by a loss of power."""
         self._said = self.status
         for loop in self.loops.values():
             loop.stop()
@@ -175,10 +174,9 @@ class SimulatedRobot:
 
 
 class SimulatedRobots:
-    """The robots of a scenario, on `schedule`; their programs are still to be started.
+    """The robots of a scenario, on `schedule`; their programs are not started yet.
 
-    `robots[i]` is robot i; `all_programs` has second programs of them, too. `layout` says where
-    all of them stand.
+    `robots[i]` is robot i; `all_programs` includes second programs of robots.
     """
 
     def __init__(
@@ -197,18 +195,16 @@ class SimulatedRobots:
         logs: bool = False,
         recorded: Path | None = None,
     ) -> None:
-        """`folder` gets fleet.toml, the world and each robot's robot.toml, which are then read.
+        """Write fleet.toml, the world and each robot's robot.toml to `folder`, and read them.
 
-        `ports` are the robots' zenoh ports; the wall clock begins at `epoch_s`, and programs are
-        numbered from `boots` on. See `Layout.write` for `settings` and `spares`. With `logs` the
-        robots write theirs in `folder`. `recorded` is such a folder of an earlier flight, whose
-        policies' steps are then taken. Raises what `Layout` does, and RecordingError.
+        `ports` are the robots' zenoh ports; the wall clock starts at `epoch_s`, and starts of
+        programs are numbered from `boots`. See `Layout.write` for `settings` and `spares`. With
+        `logs` the robots write logs in `folder`. `recorded` is such a folder of an earlier flight,
+        whose policy outputs are replayed. Raises the same as `Layout`, and RecordingError.
         """
         for table in ("autopilot", "link"):
             if table in (settings or {}):
-                raise ValueError(
-                    f"settings: {table}: simulated robots have their own: leave it out"
-                )
+                raise ValueError(f"settings: {table}: is set by the simulation: leave it out")
         self.layout = layout = Layout(scenario, bundle)
         self.folder = folder
         self.fleet_toml = folder / "fleet.toml"
@@ -247,7 +243,7 @@ class SimulatedRobots:
         self._let_fly(self.vehicles)
 
     def second_program(self, robot_id: int, vehicle: DirectVehicle) -> SimulatedRobot:
-        """Another computer that says that it is this robot, with a vehicle of its own."""
+        """Another computer with the same robot id, and a vehicle of its own."""
         first = self.robots[robot_id]
         second = self._robot(first.config, vehicle, first.world)
         self.all_programs.append(second)
@@ -262,7 +258,7 @@ class SimulatedRobots:
         )
 
     def close(self) -> None:
-        """End the robots' programs, and close their sensors."""
+        """End the robots' programs, and close the sensors."""
         for robot in self.robots:
             robot.stop()
         self._sensors.close()
@@ -302,7 +298,7 @@ class SimulatedRobots:
         raise NotImplementedError
 
     def _new_guard(self, robot: SimulatedRobot, start: int) -> Guard:
-        """Guard that that start of its program speaks and hears through."""
+        """Guard of one start of the program."""
         return Unguarded(int(1e3 * robot.clock.unix_s()) + start)
 
     def _next_boot(self) -> int:
@@ -316,7 +312,7 @@ def _step(vehicles: Sequence[DirectVehicle], dt_s: float) -> None:
 
 
 class SimulatedWatchdog:
-    """As `edge.drivers.px4.watchdog`: it goes on when the program does not."""
+    """Counterpart of `edge.drivers.px4.watchdog`, which outlives a hanging program."""
 
     def __init__(
         self, vehicle: DirectVehicle, schedule: Schedule, timeout_s: float, hover_land_s: float
@@ -332,25 +328,25 @@ class SimulatedWatchdog:
         self._alive = True
 
     def program_ended(self) -> None:
-        """A hold that it asked for it sees to its end; else PX4 misses the program itself."""
+        """Go on only if it holds the vehicle; otherwise PX4 reacts to the program's end."""
         if self._held != "holds":
             self.die()
 
     def die(self) -> None:
-        """It ends, as by kill -9."""
+        """End, as by kill -9."""
         self._alive = False
         self._looks.stop()
 
     def feed(self, *, flying: bool) -> None:
-        """The control loop lives."""
+        """Report that the control loop runs."""
         self._flying, self._fed_s, self._held = flying, self._schedule.monotonic_s(), "no"
 
     def alive(self) -> bool:
-        """Whether it has not ended."""
+        """Whether it still runs."""
         return self._alive
 
     def _look(self) -> None:
-        """Hold what was flown and is not any more; land what still holds so, a while later."""
+        """Hold a vehicle without control, and land it after a while if it still holds."""
         silent_s = self._schedule.monotonic_s() - self._fed_s
         if self._flying and self._held == "no" and silent_s >= self._timeout_s:
             self._held = "holds"
@@ -362,7 +358,7 @@ class SimulatedWatchdog:
 
 
 class _Disk:
-    """A recorder that keeps what there is a log for, until it is full."""
+    """Recorder that writes to the current log, if any, until the disk is full."""
 
     def __init__(self) -> None:
         self.log: FlightLog | None = None
@@ -370,10 +366,10 @@ class _Disk:
 
     @property
     def recording(self) -> bool:
-        """Whether it could keep more."""
+        """Whether records can be written."""
         return not self.full and (self.log is None or self.log.recording)
 
     def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
-        """Kept if there is a log for it, and room."""
+        """Write to the log, if there is one and the disk is not full."""
         if self.log is not None and not self.full:
             self.log.record(topic, unix_time_s, message)

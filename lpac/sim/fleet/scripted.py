@@ -1,7 +1,7 @@
-"""The flight of a simulated fleet, from takeoff to landing: a script of the real ground.
+"""Scripted flight of a simulated fleet, from takeoff to landing, by the real ground station.
 
-Whoever has the ground carries it out: on the simulated clock (`clocked`), or over the socket of
-`lpac ground`, with robots that are processes (`flight`).
+It is carried out on the simulated clock (`clocked`), or over the socket of `lpac ground` with
+robots as processes (`flight`).
 """
 
 import math
@@ -41,25 +41,25 @@ from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.listener import Say
 
 _PREFLIGHT_S = 60.0
-# How long robots' programs, and each one more, take to start and to be heard.
+# Time for the programs to start and connect: base, and for each robot.
 _ASSEMBLE_S, _ASSEMBLE_EACH_S = 30.0, 3.0
-# A busy machine holds robots up on their way to their heights: all land, and take off again.
+# On a busy machine robots may be late to reach their heights: all land, and take off again.
 _MOST_TAKEOFFS = 3
 _TAKE_BACK_AGAIN_S = 3.0
 
 
 class CommandOutcome(NamedTuple):
-    """A command, and its outcome."""
+    """A command and its report."""
 
     request: Request
     report: CommandReport
 
 
 class ScriptedFlight(ScriptListener):
-    """One flight: `fly`, and `land` if that cannot go on, are procedures.
+    """One flight by the procedures `fly`, and `land` if that cannot go on.
 
-    `at` is the step that it is at. `began_s` tells when each began first (the ground's clock),
-    `commands` is all that was commanded.
+    `at` is the current step. `began_s` has the first start of each step on the ground station's
+    clock, `commands` all commands.
     """
 
     def __init__(
@@ -72,9 +72,9 @@ class ScriptedFlight(ScriptListener):
         on_step: Callable[[str], None] = lambda _: None,
         say: Say = lambda _: None,
     ) -> None:
-        """`on_step` is told each step that begins, `say` what robots do that no script has.
+        """`on_step` gets each step as it begins, `say` events that are not in the script.
 
-        `perturb` is what a `MissionStep` has.
+        `perturb` is passed to `MissionStep`.
         """
         self.began_s: dict[str, float] = {}
         self.commands: list[CommandOutcome] = []
@@ -97,14 +97,14 @@ class ScriptedFlight(ScriptListener):
         self._run = ScriptRun(script, Sites(fleet_toml), ground, self)
 
     def fly(self) -> Procedure[str | None]:
-        """From the first status to the last disarming; what kept it from its end, if anything.
+        """Fly from the first status to the last disarming; returns the problem, if any.
 
-        All land then where they are.
+        After a problem all land where they are.
         """
         self.step("assemble", None)
         at_most_s = _ASSEMBLE_S + _ASSEMBLE_EACH_S * len(self._ground.setup.robots)
         if not (yield Until(lambda told: not _silent(told), at_most_s)):
-            return f"{', '.join(_silent(self._ground.snapshot))} were not heard"
+            return f"no status came from {', '.join(_silent(self._ground.snapshot))}"
         for takeoffs in range(1, _MOST_TAKEOFFS + 1):
             try:
                 yield from self._beside(self._run.fly())
@@ -122,7 +122,7 @@ class ScriptedFlight(ScriptListener):
         return problem
 
     def land(self) -> Procedure[str | None]:
-        """All land where they are; why not, if somebody does not."""
+        """Land all where they are; returns the problem, if any."""
         if all(r.status is None or is_down(r.status) for r in self._ground.snapshot.robots):
             return None
         self.step("land", None)
@@ -131,11 +131,11 @@ class ScriptedFlight(ScriptListener):
         return None if report.done else failures(report)
 
     def stop(self) -> None:
-        """End the mission now: all return, and land."""
+        """End the mission now: all return and land."""
         self._run.mission_ends = True
 
     def told_commands(self) -> tuple[ScriptCommand, ...]:
-        """`commands` as a record has them."""
+        """`commands` for the flight record."""
         return tuple(
             ScriptCommand(
                 in_words(request),
@@ -147,7 +147,7 @@ class ScriptedFlight(ScriptListener):
         )
 
     def _beside(self, script: Procedure[None]) -> Procedure[None]:
-        """The script, whose commands are noted; beside it robots are taken back."""
+        """Run the script, record its commands, and rejoin robots that left offboard."""
         answer: CommandReport | bool | None = None
         while True:
             try:
@@ -166,9 +166,9 @@ class ScriptedFlight(ScriptListener):
         return report
 
     def _take_back(self) -> Procedure[None]:
-        """Let a vehicle fly on that left offboard by itself, as on a busy machine.
+        """Rejoin vehicles that left offboard on their own, as on a busy machine.
 
-        Whom the script gives to a pilot is left to that one.
+        Vehicles that the script gave to a pilot are left alone.
         """
         left = tuple(
             robot.name
@@ -179,26 +179,26 @@ class ScriptedFlight(ScriptListener):
         if not left or self._ground.now_s - self._taken_back_s < _TAKE_BACK_AGAIN_S:
             return
         self._taken_back_s = self._ground.now_s
-        self._say(f"{', '.join(left)} left offboard: taken back")
+        self._say(f"{', '.join(left)} left offboard: sent rejoin")
         yield from self._command(RobotCommand("rejoin", left))
         if self.at == "mission":
             yield from self._command(Start(left))
 
     def step(self, name: str, at_most_s: float | None) -> None:
-        """A step begins."""
+        """Record the start of a step."""
         self.began_s.setdefault(name, self._ground.now_s)
         self.at = name
         self._on_step(name)
 
     def line(self, text: str) -> None:
-        """Something is worth a line."""
+        """Report a line of text."""
         self._say(text)
 
     def may(self, question: str) -> bool:
-        """There is one trial."""
+        """Continue without asking: there is one trial."""
         return True
 
 
 def _silent(snapshot: FleetSnapshot) -> list[str]:
-    """The robots that are not heard."""
+    """Names of the robots without a fresh status."""
     return [robot.name for robot in snapshot.robots if not robot.fresh]

@@ -1,8 +1,8 @@
-"""A whole fleet on one simulated clock: the robots' real nodes, simulated vehicles, real grounds.
+"""A fleet on one simulated clock: real nodes of robots and ground stations, simulated vehicles.
 
-Everything follows from the scenario's seed, however loaded the machine is. The policy's numbers are
-onnxruntime's, which differ in the last bits from one type of CPU to another: `fleet.recorded` takes
-them from an earlier flight.
+The flight follows from the scenario's seed, under any load of the machine. The policy's outputs are
+onnxruntime's, which differ in the last bits between types of CPU: `fleet.recorded` replays those of
+an earlier flight.
 """
 
 import copy
@@ -36,7 +36,7 @@ from lpac.sim.fleet.robots import VEHICLE_STEP_S, SimulatedRobot, SimulatedRobot
 from lpac.sim.scenario import Scenario
 from lpac.sim.schedule import Schedule, WallClock
 
-# Long after any date that a robot takes for a wrong clock.
+# Later than any date that a robot considers a wrong clock.
 EPOCH_S = 1_800_000_000.0
 _FIRST_PORT = 7447
 _PATIENCE_S = 60.0
@@ -45,9 +45,9 @@ T = TypeVar("T")
 
 
 class SimulatedFleet(SimulatedRobots):
-    """Robots, vehicles, radio and a first ground, all of them running; a ground lets time pass.
+    """Running robots, vehicles, radio and a first ground station, which advances the time.
 
-    `radio.air` is what becomes of messages. `grounds` are all that ever joined, by their names.
+    `radio.air` has the radio faults. `grounds` are all ground stations that ever joined, by name.
     """
 
     def __init__(
@@ -65,9 +65,9 @@ class SimulatedFleet(SimulatedRobots):
         recorded: Path | None = None,
         epoch_s: float = EPOCH_S,
     ) -> None:
-        """The programs of the last `absent` robots are not started yet.
+        """Start all programs but those of the last `absent` robots.
 
-        See `SimulatedRobots` for the others. Raises what `Layout` does.
+        See `SimulatedRobots` for the other parameters. Raises the same as `Layout`.
         """
         self.members = SimulatedMembers("simulated") if scenario.secure else None
         self._last_start: dict[str, int] = {}
@@ -78,7 +78,7 @@ class SimulatedFleet(SimulatedRobots):
             fleet="simulated",
             ports=range(_FIRST_PORT, _FIRST_PORT + scenario.robots),
             epoch_s=epoch_s,
-            # Programs of flights at other times are others to whoever reads their logs.
+            # Log readers must not confuse programs of flights at different times.
             boots=int(epoch_s - EPOCH_S),
             settings=settings,
             spares=spares,
@@ -96,9 +96,9 @@ class SimulatedFleet(SimulatedRobots):
     def join(
         self, operator: str, role: Role = Role.OPERATOR, *, remembers: bool = True
     ) -> "SimulatedGround":
-        """A ground of that name starts; one that runs is ended first, as by a loss of power.
+        """Start a ground station; one of that name that runs first ends, as by a loss of power.
 
-        `remembers`: it is on the computer of the one before, and finds what that left there.
+        With `remembers` it restarts on the same computer, with the state left on its disk.
         """
         former = self.grounds.get(operator)
         if former is None:
@@ -115,11 +115,10 @@ class SimulatedFleet(SimulatedRobots):
         return ground
 
     def copy(self) -> Self:
-        """The same once more, as it is now: what then happens to the one is not the other's.
+        """Independent copy of the current state, so that many flights can share their start.
 
-        So a thousand flights can begin in the air. What is on the schedule must be methods, or
-        partials of them: a function of its own goes on with the first fleet. Raises TypeError while
-        a command runs, and for a fleet that logs.
+        Callbacks on the schedule must be methods or partials of them: a plain function would act
+        on the first fleet. Raises TypeError while a command runs, and for a fleet that logs.
         """
         shared = (self._policy, self._policy.policy, self.layout.bundle, self._sensors)
         with _copyable():
@@ -143,9 +142,9 @@ class SimulatedFleet(SimulatedRobots):
 
 
 class SimulatedGround:
-    """The real ground on the simulated clock: a `Ground` for procedures, which it carries out.
+    """The real ground station on the simulated clock: a `Ground` that carries out procedures.
 
-    `runs` until it leaves; `station_id` is who it is on the radio, `clock` its computer's.
+    `runs` until it leaves; `station_id` is its id on the radio, `clock` its computer's.
     """
 
     def __init__(
@@ -158,7 +157,7 @@ class SimulatedGround:
         self.node = GroundNode(setup, self.clock, self, guard)
         self._schedule = schedule
         self._snapshot = self.node.snapshot
-        # What outlives it, on its disk.
+        # State on its disk.
         self._commanded: GroundState | None = None
         self._world = ""
         self._link = radio.link(
@@ -169,7 +168,7 @@ class SimulatedGround:
         self._ticks = schedule.every(SNAPSHOT_PERIOD_S, self._tick)
 
     def leave(self) -> None:
-        """It ends, as by a loss of power."""
+        """End, as by a loss of power."""
         if self.runs:
             self.runs = False
             self._ticks.stop()
@@ -177,12 +176,12 @@ class SimulatedGround:
             self.node.detach()
 
     def suspend(self, duration_s: float) -> None:
-        """It stands still, as a laptop that sleeps, and then goes on with all that has come."""
+        """Stop for this long, as a sleeping laptop, then handle all messages received."""
         self._link.suspended_until_s = self.now_s + duration_s
         self._ticks.hang(duration_s)
 
     def recall(self, former: "SimulatedGround") -> None:
-        """Know what the one before left on its disk."""
+        """Load the state that an earlier one left on its disk."""
         self._commanded, self._world = former._commanded, former._world
         if self._world:
             self.node.station.worlds.remember(self._world)
@@ -191,17 +190,17 @@ class SimulatedGround:
 
     @property
     def setup(self) -> FleetSetup:
-        """The fleet's setup, which seldom changes."""
+        """The fleet's setup."""
         return self.node.station.setup
 
     @property
     def snapshot(self) -> FleetSnapshot:
-        """The fleet as it was told last."""
+        """The last snapshot of the fleet."""
         return self._snapshot
 
     @property
     def now_s(self) -> float:
-        """The simulated clock."""
+        """Simulated time, s."""
         return self._schedule.monotonic_s()
 
     @property
@@ -210,11 +209,11 @@ class SimulatedGround:
         return self.clock.unix_s()
 
     def carry_out(self, procedure: Procedure[T]) -> T:
-        """Let time pass until the procedure is through; what it comes to. Raises what it raises."""
+        """Advance the time until the procedure returns. Raises the procedure's errors."""
         return carry_out(procedure, self.command, self._wait)
 
     def command(self, request: Request) -> CommandReport:
-        """Have a command done. Raises NothingComesError if it does not end."""
+        """Run a command to its report. Raises NothingComesError on timeout."""
         task = self.node.begin(request)
         end_s = self.now_s + _PATIENCE_S * len(self.setup.robots)
         while task is not None and task.report is None and self.now_s < end_s and self.runs:
@@ -224,17 +223,17 @@ class SimulatedGround:
         return task.report
 
     def told(self, message: ServerMessage) -> None:
-        """Keep the events, and the last world on the disk."""
+        """Keep the events, and the last world on disk."""
         if isinstance(message, GroundEvent):
             self.events.append(message)
         if isinstance(message, FleetSetup) and message.world:
             self._world = message.world
 
     def stepped(self) -> None:
-        """Nobody waits: time passes only while somebody looks."""
+        """Do nothing: no thread waits for it."""
 
     def commanded(self, state: GroundState) -> None:
-        """To the disk."""
+        """Keep the election's state on disk."""
         self._commanded = state
 
     def _tick(self) -> None:
@@ -251,11 +250,11 @@ class SimulatedGround:
 
 
 def _copy_count(count: Any) -> tuple[Any, tuple[int]]:
-    """Nothing else tells where it is without taking from it."""
+    """Reduce a count by its repr, the only way to read its position without advancing it."""
     return itertools.count, (int(repr(count)[len("count(") : -1]),)
 
 
-# What a copy makes anew: locks that nobody holds, since one thread runs all, and such.
+# Objects that a copy recreates. Locks are free, since one thread runs all.
 _COPIES: dict[type, Any] = {
     type(Lock()): lambda _: (Lock, ()),
     struct.Struct: lambda each: (struct.Struct, (each.format,)),

@@ -1,4 +1,4 @@
-"""The vehicles of a simulated fleet: where their robots reach them, and where they really were."""
+"""The vehicles of a simulated fleet: their MAVLink addresses and true tracks."""
 
 import math
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from lpac.sim.px4.vehicle import Px4Vehicle, Truth
 
 
 class AutopilotAddress(NamedTuple):
-    """MAVSDK address at which a robot's program reaches its vehicle, and the vehicle's id."""
+    """MAVSDK address of a vehicle, and its MAVLink system id."""
 
     url: str
     system_id: int
 
 
 class VehicleError(ValueError):
-    """A vehicle cannot start, or has ended; the text says which, why, and what to do."""
+    """A vehicle cannot start, or has ended; the text says which and why."""
 
 
 class Vehicles(Protocol):
@@ -35,7 +35,7 @@ class Vehicles(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def require_running(self) -> None:
-        """Raises VehicleError if one has ended."""
+        """Raise VehicleError if a vehicle has ended."""
 
     def tracks(self) -> tuple[TrueTrack, ...]:
         """Tracks of the vehicles so far, one each.
@@ -44,15 +44,14 @@ class Vehicles(Protocol):
         """
 
     def forget(self) -> None:
-        """Keep of each only where it is."""
+        """Drop the history of each vehicle."""
 
     def lost_s(self) -> float:
-        """By how much they fell behind real time, s."""
+        """Lateness of the vehicles behind real time, s."""
 
 
 def track_of(entries: Sequence[Truth]) -> TrueTrack:
     """Track of a simulated vehicle, on its own clock and in the world's frame."""
-
     columns = dict(zip(Truth._fields, zip(*entries, strict=True), strict=False))
 
     def of(name: str, kind: type[Any], *shape: int) -> npt.NDArray[Any]:
@@ -75,8 +74,7 @@ def track_of(entries: Sequence[Truth]) -> TrueTrack:
 class SimulatedVehicles:
     """`lpac.sim.px4` vehicles, which a thread of this process flies.
 
-    Tests do to `vehicles`, and to the `links` to their computers, what they want to happen to them,
-    while holding `stepped`.
+    Hold `stepped` to change `vehicles`, or their `links` to the robots' computers.
     """
 
     def __init__(self, vehicles: Sequence[Px4Vehicle]) -> None:
@@ -103,21 +101,21 @@ class SimulatedVehicles:
         self._server.__exit__()
 
     def require_running(self) -> None:
-        """They end with this process."""
+        """Do nothing: they end with this process."""
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """All of the same times."""
+        """Tracks of the vehicles so far, all at the same times."""
         with self.stepped:
             truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
         started_s = self._server.started_s
         return tuple(track_of(truth).shifted(started_s) for truth in truths)
 
     def forget(self) -> None:
-        """Keep of each only where it is."""
+        """Drop the history of each vehicle."""
         with self.stepped:
             for vehicle in self.vehicles:
                 del vehicle.truth[:-1]
 
     def lost_s(self) -> float:
-        """Time that this process was held up for, and that the vehicles left out."""
+        """Time that the vehicles skipped while this process was held up, s."""
         return self._server.started_s - self._began_s
