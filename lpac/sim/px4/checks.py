@@ -1,8 +1,7 @@
 """PX4's health and arming checks of the vehicle, as it reports them.
 
-Each problem belongs to a component and keeps the vehicle from being armed in some modes. A report
-is all of them at one time, and from it follow the bits of SYS_STATUS, whether a mode may be armed,
-and the events and texts that PX4 sends.
+Each problem belongs to a component and prevents arming in some modes. A report has all problems at
+one time; the bits of SYS_STATUS, the armable modes, and PX4's events and texts follow from it.
 """
 
 import math
@@ -33,7 +32,7 @@ class Component(IntEnum):
 
 
 class Level(IntEnum):
-    """How grave an event or a text is: MAV_SEVERITY, and what only programs read."""
+    """Severity of an event or a text: MAV_SEVERITY, and a level for programs alone."""
 
     EMERGENCY = 0
     CRITICAL = 2
@@ -45,9 +44,9 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Px4Event:
-    """Report of the vehicle: an EVENT, and beside it a text where PX4 has one.
+    """An EVENT of the vehicle, with a STATUSTEXT where PX4 has one.
 
-    `number` is the event's in PX4's own list.
+    `number` is the event's id in PX4.
     """
 
     number: int
@@ -61,8 +60,8 @@ class Px4Event:
 class ArmingProblem:
     """One check that fails; masks have a bit per `Px4Mode`.
 
-    In the modes of `keeps_from_arming` the vehicle is not armed, and in those of
-    `keeps_from_running` it cannot be. `told_modes` is what the event names.
+    `keeps_from_arming` has the modes in which arming is refused, `keeps_from_running` those that
+    cannot be entered, `told_modes` those that the event reports.
     """
 
     number: int
@@ -146,7 +145,7 @@ _ARMING_SUMMARY, _HEALTH_SUMMARY = 11047904, 1914663
 
 @dataclass(frozen=True, slots=True)
 class HealthReport:
-    """All that is wrong at one time, and what is there at all."""
+    """All problems at one time, and the components present."""
 
     problems: tuple[ArmingProblem, ...] = ()
     present: frozenset[Component] = frozenset()
@@ -204,10 +203,10 @@ def _union(masks: Iterable[int]) -> int:
 
 
 class HealthReporter:
-    """Says when PX4 reports: at most every two seconds what has changed, and at once if asked.
+    """Timing of PX4's reports: changes at most every two seconds, and at once on request.
 
-    SYS_STATUS tells of the `published` report; there is none in the first seconds. `newest` is what
-    was found at `checked_at_s`.
+    SYS_STATUS shows the `published` report, None in the first seconds. `newest` is of
+    `checked_at_s`.
     """
 
     _INTERVAL_S, _FIRST_S = 2.0, 2.1
@@ -220,7 +219,7 @@ class HealthReporter:
         self._reported_at_s = self._FIRST_S - self._INTERVAL_S
 
     def update(self, report: HealthReport, now_s: float, *, asked: bool = False) -> list[Px4Event]:
-        """Take in the checks of now; returns what PX4 tells about them."""
+        """Update the checks; returns the events that PX4 sends about them."""
         self.newest, self.checked_at_s = report, now_s
         is_due = report != self._reported and now_s >= self._reported_at_s + self._INTERVAL_S
         if not (is_due or asked):
@@ -229,9 +228,9 @@ class HealthReporter:
         return self._tell(now_s)
 
     def before_failsafe(self, now_s: float) -> list[Px4Event]:
-        """Report at once what was not told yet, since a failsafe is about to act on it.
+        """Report pending changes at once, before a failsafe acts on them.
 
-        PX4 tells it by events alone: SYS_STATUS stays behind until the next report.
+        PX4 does so by events alone: SYS_STATUS shows them with the next report.
         """
         return self._tell(now_s) if self.newest != self._reported else []
 

@@ -1,4 +1,4 @@
-"""A simulated vehicle behind the robot's ports, in process: no socket, on a simulated clock."""
+"""A simulated vehicle behind the robot's ports, in process, without a socket."""
 
 import struct
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +17,7 @@ from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.px4.world import FencePolygon
 
 _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
-# Which fields count; see MAVLink's POSITION_TARGET_TYPEMASK.
+# Masks of ignored fields; see MAVLink's POSITION_TARGET_TYPEMASK.
 _VELOCITY_MASK, _POSITION_MASK = 0b110111000111, 0b110111111000
 _AUTOPILOT, _COMPANION = 1, 191  # component ids
 # Message -> the field with the vehicle's time, and its unit, s.
@@ -29,10 +29,10 @@ _TIMES = {
 
 
 class DirectVehicle:
-    """A `Vehicle` and its `VehicleSetup`; `step` lets its time pass.
+    """A `Vehicle` and its `VehicleSetup`; `step` advances its time.
 
-    It says and hears MAVLink, message by message, as over a wire, and rounded as on one: what the
-    robot knows of it is what PX4 tells, at PX4's rates.
+    It exchanges MAVLink message objects, rounded as on a wire, so that the robot gets what PX4
+    sends, at PX4's rates.
     """
 
     def __init__(self, vehicle: Px4Vehicle, system_id: int, clock: Clock) -> None:
@@ -44,14 +44,14 @@ class DirectVehicle:
         self._uploaded: tuple[FencePolygon, ...] = ()
         self._dialogue = Dialogue(self._telemetry)
         self._frames = VehicleFrames()
-        # Last answer, when, and with what came of commands: a robot asks several times a tick.
-        # Messages clear it.
+        # Cached state with its time and command result, since a robot asks several times a tick;
+        # each step clears it.
         self._told: tuple[float, ActionResult | None, VehicleState] | None = None
-        # Nobody else listens on this link: what the robot does not read costs time alone.
+        # The link has no other subscriber, so messages that the robot does not read only cost time.
         self._link.silence(self._telemetry.messages)
 
     def step(self, dt_s: float) -> None:
-        """Let the vehicle fly on, and hear what it says."""
+        """Advance the vehicle, and receive its messages."""
         self._told = None
         self.vehicle.step(dt_s)
         now_s = self._clock.monotonic_s()
@@ -63,10 +63,8 @@ class DirectVehicle:
         if now_s >= self._dialogue.next_s or self._telemetry.needs_origin():
             self._say(now_s)
 
-    # The robot's ports
-
     def state(self) -> VehicleState:
-        """The newest of everything."""
+        """The vehicle's state by its last messages."""
         now_s, result = self._clock.monotonic_s(), self._dialogue.result
         if self._told is None or self._told[:2] != (now_s, result):
             state = self._telemetry.state(
@@ -77,7 +75,7 @@ class DirectVehicle:
         return self._told[2]
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
-        """Send it once."""
+        """Send a setpoint once."""
         position_m = velocity_m_s = (0.0, 0.0, 0.0)
         if isinstance(setpoint, Velocity):
             mask, velocity_m_s = _VELOCITY_MASK, setpoint.velocity_local_m_s
@@ -92,7 +90,7 @@ class DirectVehicle:
         return setpoint
 
     def command(self, action: Action) -> None:
-        """Ask for it; what came of it is known after the vehicle's next step."""
+        """Command an action; its result is known after the vehicle's next step."""
         now_s = self._clock.monotonic_s()
         self._dialogue.command(action, now_s)
         self._say(now_s)
@@ -102,18 +100,16 @@ class DirectVehicle:
         return {name: self.vehicle.parameters.get(name) for name in names}
 
     def set_parameter(self, name: str, value: int | float) -> None:
-        """Set one."""
+        """Set a parameter of PX4."""
         self.vehicle.parameters[name] = value
 
     def upload_fence(self, vertices_deg: Sequence[tuple[float, float]]) -> None:
-        """Replace the fence by one polygon to stay in."""
+        """Replace the fence by one inclusion polygon."""
         self.vehicle.fence = self._uploaded = (FencePolygon(True, tuple(vertices_deg)),)
 
     def has_fence(self) -> bool:
-        """Whether it still has the one that was uploaded."""
+        """Whether it still has the uploaded fence."""
         return bool(self._uploaded) and self.vehicle.fence == self._uploaded
-
-    # What it sends
 
     def _say(self, now_s: float) -> None:
         for name, fields in self._dialogue.due_messages(now_s, self.state()):
@@ -129,15 +125,13 @@ class DirectVehicle:
                     mavlink.MAVLink_command_long_message(self._system_id, _AUTOPILOT, **fields)
                 )
 
-    # The wire
-
     def _send(self, message: Any) -> None:
         header = message.get_header()
         header.srcSystem, header.srcComponent = self._system_id, _COMPANION
         self._link.hear(_rounded(message))
 
     def _said(self, now_s: float) -> Iterable[tuple[str, Mapping[str, Any]]]:
-        """Name and fields of each message of the vehicle's that is taken now."""
+        """Name and fields of each accepted message of the vehicle."""
         for message in self._link.say():
             number, message_id = message.link_number, message.get_msgId()
             time_name, unit_s = _TIMES.get(message_id, ("", 0.0))
@@ -147,7 +141,7 @@ class DirectVehicle:
 
 
 def _rounded(message: Any) -> Any:
-    """The message itself, its real numbers being such as MAVLink has bits for."""
+    """The message, its real numbers rounded in place to MAVLink's 32 bits."""
     names, bits = _real_fields(message.__class__)
     if names:
         fields = vars(message)
@@ -158,7 +152,7 @@ def _rounded(message: Any) -> Any:
 
 @cache
 def _real_fields(kind: Any) -> tuple[tuple[str, ...], struct.Struct]:
-    """Names of a message's 32-bit reals, but for those in arrays, and their packed form."""
+    """Names of a message's 32-bit reals, except arrays, and their packed form."""
     types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
     names = tuple(
         name

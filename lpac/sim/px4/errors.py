@@ -1,7 +1,7 @@
-"""How the sensors, the battery and the air of a vehicle err: by its own seed and its fleet's.
+"""Errors of a vehicle's sensors and battery, and wind, from its own seed and its fleet's.
 
-Everything is a smooth function of time, drawn once: no state, no step. What a vehicle takes itself
-to be follows from the truth and from this.
+All are functions of time, drawn once, without state. A vehicle's estimates are its true state plus
+these errors.
 """
 
 import math
@@ -12,25 +12,25 @@ import numpy as np
 from edge.core.vehicle import Vector
 from lpac.sim.px4.vector import plus, times
 
-# Of the whole horizontal error of a receiver.
+# Range of a receiver's total horizontal error.
 LEAST_BIAS_M, GREATEST_BIAS_M = 1.0, 5.0
-# What it says of itself, horizontally: it knows its noise, and little of what biases it for long.
+# Accuracy that it reports, horizontally: it includes noise, but hardly any slow bias.
 GPS_ACCURACIES_M, GPS_VERTICAL = (0.8, 1.4), 2.0
 SATELLITES = (8, 16)
-# Its fix, which an estimator smooths: noise, and now and then an echo from a wall or a tree.
+# Errors of a fix, which the estimator smooths: noise, and now and then multipath.
 _FIX_WAVES, _FIX_WAVE_M, _FIX_PERIODS_S = 4, 0.2, (2.0, 60.0)
 _ECHOES_M, _ECHO_EVERY_S, _ECHO_FOR_S = (1.0, 3.5), (120.0, 400.0), (3.0, 15.0)
-# How far it walks, in its length and across, either way.
+# Drift of the bias, along its length and across, either way.
 _WALK_M, _WALK_PERIODS_S = 0.4, (200.0, 700.0)
 
-# How wrong the horizontal velocity's estimate is along each axis: 0.25 m/s rms, 0.6 m/s at most. In
-# PX4's own simulation a real PX4's was wrong by 0.03 to 0.46 m/s rms, and like itself for some 3 s.
+# Error of the estimated horizontal velocity along each axis: 0.25 m/s rms, 0.6 m/s at most. In
+# PX4's own simulation that of a real PX4 was 0.03 to 0.46 m/s rms, correlated over some 3 s.
 _VELOCITY_WAVES, _VELOCITY_WAVE_M_S, _VELOCITY_PERIODS_S = 3, 0.2, (10.0, 30.0)
 
-# All heights of a fleet walk together: so much within a quarter of the period.
+# All heights of a fleet drift together, by this much within a quarter of the period.
 COMMON_HEIGHT_M, COMMON_HEIGHT_PERIOD_S = 3.0, 1200.0
-# A barometer and the height of a GPS reference, for each vehicle: what they come to differ by since
-# any moment is four times that, between two vehicles eight times.
+# Amplitude of each vehicle's barometer and GPS height: the drift since any moment is at most four
+# times that, between two vehicles eight times.
 OWN_HEIGHT_M, _OWN_HEIGHT_PERIODS_S = 0.25, (150.0, 600.0)
 
 COMPASS_RAD = math.radians(20.0)
@@ -43,7 +43,7 @@ _MEAN_WINDS_M_S, _GUST_PERIODS_S = (1.0, 4.0), (20.0, 45.0)
 _RESISTANCES_OHM = (0.02, 0.03)
 _DRAINS = (1.0, 1.25)
 _WEAK_MOTOR_SHARE, _THRUST_LOSSES = 0.15, (0.05, 0.2)
-# The remote control's receiver hears nothing for a while, again and again.
+# The remote control's receiver repeatedly loses the signal for a while.
 _STALE_EVERY_S, _STALE_FOR_S = (90.0, 240.0), (0.3, 3.0)
 
 
@@ -54,7 +54,7 @@ def draw_bias_m(share: float, bearing_rad: float) -> tuple[float, float]:
 
 
 class Wave(NamedTuple):
-    """Sine around where it was at time 0; `began` is the sine of its phase."""
+    """Sine wave, 0 at time 0; `began` is the sine of its phase."""
 
     amplitude: float
     rate_rad_s: float
@@ -62,22 +62,21 @@ class Wave(NamedTuple):
     began: float
 
     def at(self, time_s: float) -> float:
-        """How far it has walked since time 0."""
+        """Change since time 0."""
         amplitude, rate_rad_s, phase_rad, began = self
         return amplitude * (math.sin(rate_rad_s * time_s + phase_rad) - began)
 
     def about(self, time_s: float) -> float:
-        """How far it is from its middle."""
+        """Offset from the mean."""
         return self.amplitude * math.sin(self.rate_rad_s * time_s + self.phase_rad)
 
 
 class Errors:
-    """How one vehicle errs. `fleet_seed` and `mean_wind_m_s` are the same for all of a fleet.
+    """Errors of one vehicle. A fleet's vehicles share `fleet_seed` and `mean_wind_m_s`.
 
-    The mean wind is drawn where it is None.
-
-    `thrust_loss` is the share of its thrust that a weak motor costs it, 0 for most. `drain` is by
-    how much sooner its pack is empty than a new one, `resistance_ohm` what makes its voltage sag.
+    The mean wind is drawn if it is None. `thrust_loss` is the share of thrust lost by a weak motor,
+    0 for most. `drain` is the battery's rate of discharge relative to a new one, `resistance_ohm`
+    its internal resistance.
     """
 
     def __init__(self, seed: int, fleet_seed: int, mean_wind_m_s: float | None = None) -> None:
@@ -127,9 +126,9 @@ class Errors:
         ]
 
     def position_m(self, time_s: float, bias_m: Vector) -> Vector:
-        """North, east, down: what the estimate errs by, of a receiver that began with a bias.
+        """Error of the estimate, north, east, down, for a receiver with this initial bias.
 
-        A receiver without any horizontal bias does not walk.
+        Without any horizontal bias the receiver does not drift.
         """
         north_m, east_m, down_m = bias_m
         if began_m := math.hypot(north_m, east_m):
@@ -141,9 +140,9 @@ class Errors:
         return north_m, east_m, down_m + self.height_m(time_s)
 
     def fix_m(self, time_s: float) -> Vector:
-        """North, east, down: by how much a receiver's fix is further off than the estimate.
+        """Error of a receiver's fix relative to the estimate, north, east, down.
 
-        It is noise of a few decimetres, and an echo of up to 3.5 m for some seconds.
+        It has noise of a few decimetres, and multipath of up to 3.5 m for some seconds.
         """
         noise_m = [_sum_about(waves, time_s) for waves in self._fix]
         since_s = time_s % self._echo_every_s - (self._echo_every_s - self._echo_for_s)
@@ -151,7 +150,7 @@ class Errors:
         return plus(noise_m, times(self._echo_m, echo))
 
     def velocity_m_s(self, time_s: float) -> Vector:
-        """North, east, down: what the estimate of the velocity errs by; 0 down."""
+        """Error of the estimated velocity, north, east, down; 0 down."""
         north, east = self._velocity
         return _sum_about(north, time_s), _sum_about(east, time_s), 0.0
 
@@ -167,11 +166,11 @@ class Errors:
         return least + round((greatest - least) * self._share_of_sky(time_s))
 
     def _share_of_sky(self, time_s: float) -> float:
-        """How well the satellites stand just now, 0 to 1."""
+        """Quality of the satellites' geometry now, 0 to 1."""
         return 0.5 + 0.5 * self._sky.about(time_s)
 
     def height_m(self, time_s: float) -> float:
-        """By how much lower than at the start the vehicle takes itself to be, where it is."""
+        """Error of the estimated height since the start, positive down."""
         return math.fsum(
             [
                 a * (math.sin(rate * time_s + phase) - began)
@@ -180,7 +179,7 @@ class Errors:
         )
 
     def heading_rad(self, time_s: float) -> float:
-        """By how much the compass is wrong; the estimator may notice in flight, in one go."""
+        """Error of the compass; the estimator may correct it once in flight."""
         return self._heading_rad if time_s < self._yaw_reset_s else self._heading_after_rad
 
     def wind_m_s(self, time_s: float) -> Vector:
@@ -191,12 +190,12 @@ class Errors:
         return times(self._wind_direction, speed_m_s)
 
     def is_remote_control_stale(self, time_s: float) -> bool:
-        """Whether the remote control's receiver hears nothing just now."""
+        """Whether the remote control's receiver has no signal now."""
         return time_s % self._stale_every_s > self._stale_every_s - self._stale_for_s
 
 
 def _sum_about(waves: list[Wave], time_s: float) -> float:
-    """How far the sum of the waves is from its middle."""
+    """Sum of the waves, as offset from the mean."""
     return math.fsum([a * math.sin(rate * time_s + phase) for a, rate, phase, _ in waves])
 
 

@@ -1,4 +1,4 @@
-"""How well a vehicle knows where it is: when the estimator trusts its position, and how it errs.
+"""Model of PX4's estimator: when it trusts its position, and the errors of its estimate.
 
 Times are those of a real PX4 v1.17, by its own clock.
 """
@@ -11,37 +11,37 @@ from lpac.sim.px4.vector import ZERO, level, minus, plus, times, total
 
 NOISE_M = (0.15, 0.15, 0.1)
 NOISE_TIME_S = 10.0
-# After the start: when the origin is chosen and the attitude found; how long before the position is
-# good the attitude is trusted, and GPS is used.
+# Times after the start at which the origin is set and the attitude aligned; times before the
+# position is valid from which on the attitude is trusted, and GPS is used.
 ORIGIN_AFTER_S = 0.64
 ALIGNED_AFTER_S = 2.0
 ATTITUDE_BEFORE_READY_S = 2.0
 FUSION_BEFORE_READY_S = 1.05
-# For so long the estimator vouches for a position that no GPS holds, and for so long it goes on
-# waiting for the GPS. One that comes back after that is used again `GPS_REGAIN_S` later.
+# How long a position without GPS counts as valid, and how long GPS counts as used. A GPS that comes
+# back later is used again after `GPS_REGAIN_S`.
 DEAD_RECKONING_S = 5.0
 GPS_FUSION_S = 7.0
 GPS_REGAIN_S = 1.2
 DEAD_RECKONING_DRIFT_M = 0.5  # per square root of a second
-# A fix further off than PX4's gates is rejected, for so long; any other is followed smoothly. Rates
-# of the correction, as a real PX4 v1.17 was seen to follow a receiver that repeats itself: of the
-# position, the velocity and the tilt (as an acceleration) by the place, of the velocity by its own.
+# A fix beyond PX4's gates is rejected for this time; any other is followed smoothly. Correction
+# gains, as measured with a real PX4 v1.17 and a stuck receiver: of position, velocity and tilt (as
+# an acceleration) by the position error, of velocity by the velocity error.
 GPS_GATE_M, GPS_GATE_M_S, GPS_REJECTED_S = 5.0, 4.0, 7.0
 GPS_BY_PLACE, GPS_VELOCITY_BY_VELOCITY = (0.96, 0.33, 0.12), 0.25
 
 
 class Estimator:
-    """A vehicle's knowledge of its position, as time passes."""
+    """Estimate of a vehicle's position over time."""
 
     def __init__(self, ready_after_s: float, noise_m: Vector) -> None:
-        """The position is good `ready_after_s` after the start; `noise_m` errs first."""
+        """`ready_after_s` is when the position becomes valid; `noise_m` is the initial error."""
         self._ready_after_s = ready_after_s
         self._time_s = 0.0
         self._noise_m = noise_m
         self._drift_m = ZERO
-        # Noise, what dead reckoning has gathered, jumps it believes: north, east, down.
+        # Noise, drift of dead reckoning, and followed errors of fixes: north, east, down.
         self.error_m = noise_m
-        # It has never been there.
+        # There was no GPS yet.
         self._gps_lost_since_s = -math.inf
         self._gps_back_at_s = -math.inf
         self._followed_m = self.velocity_error_m_s = self._tilt_error_m_s2 = ZERO
@@ -50,22 +50,22 @@ class Estimator:
 
     @property
     def has_origin(self) -> bool:
-        """Whether the origin is chosen: by the first GPS fix."""
+        """Whether the origin is set, by the first GPS fix."""
         return self._time_s >= min(ORIGIN_AFTER_S, self._ready_after_s)
 
     @property
     def is_aligned(self) -> bool:
-        """Whether it has found its attitude; it is trusted a little later."""
+        """Whether the attitude is aligned; it is trusted a little later."""
         return self._time_s >= min(ALIGNED_AFTER_S, self._ready_after_s)
 
     @property
     def has_attitude(self) -> bool:
-        """Whether the attitude is known."""
+        """Whether the attitude is trusted."""
         return self._time_s >= self._ready_after_s - ATTITUDE_BEFORE_READY_S
 
     @property
     def is_ready(self) -> bool:
-        """Whether it has ever been long enough for a position."""
+        """Whether the time after the start suffices for a position."""
         return self._time_s >= self._ready_after_s
 
     @property
@@ -80,12 +80,12 @@ class Estimator:
 
     @property
     def is_held(self) -> bool:
-        """Whether GPS holds the position, or did so a moment ago."""
+        """Whether GPS holds the position, or did a moment ago."""
         return self._is_held(DEAD_RECKONING_S)
 
     @property
     def accuracy_m(self) -> tuple[float, float]:
-        """Its own accuracy, as it takes it, horizontally and vertically."""
+        """Its estimate of its own accuracy, horizontal and vertical, m."""
         if not self.is_aligned:
             return 14.1, 1.8
         if not self.has_used_gps:
@@ -95,7 +95,7 @@ class Estimator:
 
     @property
     def doubts_gps(self) -> bool:
-        """Whether GPS is back, but not believed yet; or it jumped."""
+        """Whether GPS is back but not used yet, or its fixes are rejected."""
         is_new = self._time_s < self._gps_back_at_s
         return self.has_gps and (is_new or self._rejects_since_s < math.inf)
 
@@ -106,7 +106,7 @@ class Estimator:
 
     @property
     def position_valid(self) -> bool:
-        """Whether the estimator vouches for its position."""
+        """Whether the estimated position is valid."""
         return self._time_s >= self._ready_after_s and self._is_held(DEAD_RECKONING_S)
 
     def _is_held(self, without_gps_s: float) -> bool:
@@ -122,13 +122,13 @@ class Estimator:
         off_m_s: Vector,
         draws: Sequence[float],
     ) -> None:
-        """One step of time: the fix's place and velocity err by `off_m` and `off_m_s`.
+        """Advance by one step; the fix has the errors `off_m` and `off_m_s`.
 
-        `draws` (6,) are normal.
+        `draws` (6,) are standard normal.
         """
         self._time_s = time_s
         if has_gps:
-            # Mostly there is nothing to follow, and never was.
+            # Skip the costly part until a fix is wrong for the first time.
             self._followed_once = self._followed_once or off_m != ZERO or off_m_s != ZERO
             if self._followed_once:
                 self._follow(off_m, off_m_s, dt_s)
@@ -138,7 +138,7 @@ class Estimator:
                 self._gps_lost_since_s = math.inf
             self._drift_m = ZERO
         else:
-            # Without it, gravity tells the tilt.
+            # Without GPS, gravity corrects the tilt.
             self._tilt_error_m_s2 = ZERO
             self._followed_m = plus(self._followed_m, times(self.velocity_error_m_s, dt_s))
             self._gps_lost_since_s = min(self._gps_lost_since_s, time_s)
@@ -155,7 +155,7 @@ class Estimator:
         self.error_m = total(self._noise_m, self._drift_m, self._followed_m)
 
     def _follow(self, off_m: Vector, off_m_s: Vector, dt_s: float) -> None:
-        """Go after a fix that lies; where it is too far off to be true, wait, then start over."""
+        """Follow a wrong fix; reject one beyond the gates for a while, then reset to it."""
         place_m = minus(off_m, self._followed_m)
         speed_m_s = minus(off_m_s, self.velocity_error_m_s)
         far = math.hypot(*place_m) > GPS_GATE_M or math.hypot(*speed_m_s) > GPS_GATE_M_S

@@ -1,4 +1,4 @@
-"""Choice of the failsafe that acts, and when."""
+"""Selection and timing of PX4's failsafe actions."""
 
 import math
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from lpac.sim.px4.modes import (
 
 
 class Failsafe:
-    """PX4's reaction to all that has gone wrong. `action` is what it does now."""
+    """PX4's reaction to failures; `action` is the current one."""
 
     def __init__(self) -> None:
         self.action = FailsafeAction.NONE
@@ -24,21 +24,21 @@ class Failsafe:
 
     @property
     def is_active(self) -> bool:
-        """Whether it decides the mode."""
+        """Whether it determines the mode."""
         return self.action > FailsafeAction.WARN
 
     def reset(self) -> None:
-        """The vehicle was armed or disarmed."""
+        """Reset on arming or disarming."""
         self.end()
         self._taken_over = False
 
     def end(self) -> None:
-        """Do nothing, since nothing is wrong."""
+        """Clear the action, as nothing is wrong."""
         self.action = FailsafeAction.NONE
         self._wanted = {}
 
     def take_over(self) -> bool:
-        """Somebody asks for a mode; whether that ends a failsafe which was active."""
+        """Handle a mode command; returns whether it ends an active failsafe."""
         ends = self.is_active and not self._taken_over
         self._taken_over = self._taken_over or ends
         return ends
@@ -52,10 +52,10 @@ class Failsafe:
         intended_mode: Px4Mode,
         position_valid: bool,
     ) -> FailsafeCause:
-        """Set `action`; returns whose it is.
+        """Set `action`; returns its cause.
 
-        `wanted` is what each cause calls for; call `end` instead if none calls for anything.
-        `delay_s` is COM_FAIL_ACT_T: for so long the vehicle holds, for somebody to take it over.
+        `wanted` is the action for each cause; call `end` instead if there is none. `delay_s` is
+        COM_FAIL_ACT_T: the vehicle first holds this long, to allow a takeover.
         """
         for cause, action in wanted.items():
             if action >= FailsafeAction.HOLD > self._wanted.get(cause, FailsafeAction.NONE):

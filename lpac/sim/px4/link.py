@@ -1,9 +1,9 @@
 """MAVLink 2 for one simulated vehicle, as messages or as datagrams; no socket and no clock.
 
-What is told, when and in which bits is PX4 v1.17's: tests/sim/sim/test_px4_recordings.py holds it
-to recordings of a real one, on its link to a companion computer. Parameters travel with their bytes
-in the float, an unknown parameter gets no answer, a fence is uploaded as a mission. What anybody
-changes is told to everybody: a parameter at once, the fence's id once a second.
+Contents, times and bits are those of PX4 v1.17: tests/sim/sim/test_px4_recordings.py compares them
+with recordings of a real one, on its link to a companion computer. Parameters are encoded bytewise
+in the float, an unknown parameter gets no answer, a fence is uploaded as a mission. Changes are
+sent to all clients: a parameter at once, the fence's id once a second.
 """
 
 import math
@@ -26,14 +26,14 @@ FORCE = 21196.0  # MAV_CMD_COMPONENT_ARM_DISARM: param 2 that skips the checks
 FIRMWARE_VERSION = 1 << 24 | 17 << 16 | 0 << 8 | 255  # 1.17.0, release
 PARAMETERS_AT_ONCE = 10
 MAX_DATAGRAM_BYTES = 1400
-# Texts go out only where a ground station was heard within this, and no older than that.
+# Texts are sent only if a ground station was heard within this time, and up to this age.
 GROUND_STATION_HEARD_S = 2.5
 TEXT_KEPT_S = 5.0
 TEXT_BYTES = 50
 GPS_SILENT_S = 1.0
 EVENTS_KEPT = 40
 
-# PX4 has no custom mode that only it can set.
+# DESCEND cannot be commanded.
 _MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
 _HEARD_OF = {
     Component.GYROSCOPE: mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO,
@@ -48,7 +48,7 @@ _HEARD_OF = {
     Component.BATTERY: mavlink.MAV_SYS_STATUS_SENSOR_BATTERY,
     Component.LOGGING: mavlink.MAV_SYS_STATUS_LOGGING,
 }
-# Nothing that could go wrong with these is simulated.
+# Their failures are not simulated.
 _NEVER_ILL = (
     mavlink.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE
     | mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
@@ -76,9 +76,9 @@ _UNKNOWN_COVARIANCE = [math.nan] + [0.0] * 20
 
 
 class _Message(mavlink.MAVLink_message):  # type: ignore[misc]
-    """A message of PX4's that pymavlink does not have, or has without its last fields.
+    """A message of PX4 that pymavlink lacks, or has without its last fields.
 
-    `fields` are in the order in which `packed` has them.
+    `fields` are in the order of the format `packed`.
     """
 
     def __init__(self, number: int, name: str, crc_extra: int, packed: str, **fields: Any) -> None:
@@ -93,7 +93,7 @@ class _Message(mavlink.MAVLink_message):  # type: ignore[misc]
 
 
 def request_event(first_sequence: int, last_sequence: int) -> Any:
-    """The message that asks PX4 for events again."""
+    """The message that requests events from PX4 again."""
     return _Message(
         412, "REQUEST_EVENT", 33, "<HHBB", first_sequence=first_sequence,
         last_sequence=last_sequence, target_system=0, target_component=0,
@@ -101,18 +101,18 @@ def request_event(first_sequence: int, last_sequence: int) -> Any:
 
 
 class Px4Link:
-    """MAVLink of one vehicle: its messages, their times, and the commands that it understands.
+    """MAVLink of one vehicle: its messages, their times, and its commands.
 
-    Over a wire: give it datagrams (`receive`), take from it those that are due (`due`). Within one
-    process the same goes as message objects (`hear`, `say`), which costs a tenth: their numbers
-    must be rounded as MAVLink would. What is lost, late or doubled on the way is the vehicle's
-    `wire`. Each message that is said has its `link_number`, from 1 on.
+    Over a wire it receives datagrams (`receive`) and returns those due (`due`). Within one process
+    it exchanges message objects (`hear`, `say`), at a tenth of the cost: the caller must round
+    their numbers as MAVLink does. The vehicle's `wire` has loss, delay and repeats. Each outgoing
+    message has a `link_number`, from 1 on.
     """
 
     def __init__(
         self, vehicle: Px4Vehicle, *, system_id: int, hardware_uid: int | None = None
     ) -> None:
-        """`hardware_uid` is the system id unless given; on some boards it is the same on all."""
+        """`hardware_uid` defaults to the system id; some boards all have the same."""
         self.vehicle = vehicle
         self.system_id = system_id
         vehicle.parameters["MAV_SYS_ID"] = system_id
@@ -154,7 +154,7 @@ class Px4Link:
             mavlink.MAVLINK_MSG_ID_MISSION_CURRENT: (1.0, self._mission_current),
         }
         self._builders = {message: build for message, (_, build) in streams.items()}
-        # What a client that asks for it gets, where that is not what the stream sends.
+        # Builders for messages on request, where they differ from the stream's.
         self._on_request = {mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._gps_global_origin}
         self._default_rates_hz = {message: rate_hz for message, (rate_hz, _) in streams.items()}
         self._intervals_s: dict[int, float] = {}
@@ -194,19 +194,19 @@ class Px4Link:
         }
 
     def silence(self, but: Collection[str]) -> None:
-        """Send none of the streams but those of these messages, until they are asked for."""
+        """Stop all streams except those of these messages."""
         for message_id in self._builders:
             kind = mavlink.mavlink_map.get(message_id)
             if message_id and kind is not None and kind.msgname not in but:
                 self._set_interval(message_id, math.inf)
 
     def receive(self, datagram: bytes) -> None:
-        """Act on what a client sent; anything that is no MAVLink, or not for us, is ignored."""
+        """Handle a client's datagram; other data, and messages to others, are ignored."""
         for message in self._mavlink.parse_buffer(datagram) or ():
             self.hear(message)
 
     def hear(self, message: Any) -> None:
-        """Act on one message of a client; one that is not for us is ignored."""
+        """Handle a client's message; those to others are ignored."""
         kind = message.get_type()
         self.vehicle.commands += kind in _COMMAND_KINDS
         if self._on_the_wire.is_lost(self.vehicle.wire):
@@ -217,7 +217,7 @@ class Px4Link:
             handler(message)
 
     def due(self) -> list[bytes]:
-        """The datagrams to send now: what there is to say, packed."""
+        """The datagrams to send now."""
         datagrams = [b""]
         for message in self.say():
             self._mavlink.seq = message.link_number % 256
@@ -228,7 +228,7 @@ class Px4Link:
         return [datagram for datagram in datagrams if datagram]
 
     def say(self) -> list[Any]:
-        """The messages that arrive now: answers first, then the streams whose time has come."""
+        """The messages that arrive now: answers first, then the streams that are due."""
         vehicle = self.vehicle
         for event in vehicle.take_events():
             self._event_sequence = (self._event_sequence + 1) % 0x10000
@@ -264,14 +264,14 @@ class Px4Link:
         self._out.append(message)
 
     def _send_now(self, message_id: int, build: Callable[[], Any] | None = None) -> bool:
-        """Whether there was something to tell."""
+        """Send a message; returns whether there was one."""
         message = (build or self._builders[message_id])()
         if message is not None:
             self._send(message)
         return message is not None
 
     def _send_texts(self) -> None:
-        """Only to a ground station, and nothing stale; in chunks where they are long."""
+        """Send fresh texts if a ground station is heard, long ones in chunks."""
         now_s = self.vehicle.time_s
         if now_s - self._ground_station_at_s <= GROUND_STATION_HEARD_S:
             for at_s, event in self._texts:
@@ -291,15 +291,13 @@ class Px4Link:
             self._texts.popleft()
 
     def _set_interval(self, message_id: int, interval_s: float) -> None:
-        """It counts from the message that was sent last."""
+        """Set a stream's interval, counted from its last message."""
         last_s = self._due_s[message_id] - self._intervals_s[message_id]
         if math.isnan(last_s):
             last_s = self.vehicle.time_s
         self._intervals_s[message_id] = interval_s
         self._due_s[message_id] = last_s + interval_s
         self._next_due_s = min(self._due_s.values())
-
-    # Streams
 
     def _boot_ms(self) -> int:
         return int(self.vehicle.time_s * 1e3)
@@ -328,7 +326,7 @@ class Px4Link:
         )
 
     def _sys_status(self) -> Any:
-        """PREARM_CHECK is told in health alone, of the mode that is set, by the last report."""
+        """PREARM_CHECK is in the health bits alone, for the current mode by the last report."""
         vehicle = self.vehicle
         report = vehicle.health
         present, healthy = 0, _NEVER_ILL
@@ -373,7 +371,7 @@ class Px4Link:
         )
 
     def _moved_origin(self) -> Any:
-        """The stream tells of it only when it is another one."""
+        """The origin if it has changed: the stream sends it only then."""
         is_known = self._origin_told == self.vehicle.global_origin
         return None if is_known else self._gps_global_origin()
 
@@ -392,7 +390,7 @@ class Px4Link:
         )  # fmt: skip
 
     def _mission_current(self) -> Any:
-        """There is no mission; of interest is the fence's id alone."""
+        """There is no mission; the message carries the fence's id."""
         return _Message(
             mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, "MISSION_CURRENT", 28, "<HHBBIII", seq=0,
             total=0xFFFF, mission_state=1, mission_mode=0, mission_id=0, fence_id=self._fence_id(),
@@ -457,7 +455,7 @@ class Px4Link:
         if vehicle.silent_s(SimulatedSensor.GPS) >= 0.0:
             if vehicle.time_s - self._gps_told_at_s <= GPS_SILENT_S:
                 return None
-            # No driver: nothing is known, not even an accuracy.
+            # Without a driver all fields are unknown, even the accuracy.
             self._gps_told_at_s = vehicle.time_s
             unknown = 0xFFFF
             return mavlink.MAVLink_gps_raw_int_message(
@@ -502,12 +500,12 @@ class Px4Link:
         return cos * north + sin * east, cos * east - sin * north, down
 
     def _tilt_rad(self) -> tuple[float, float]:
-        """Roll and pitch that the horizontal acceleration takes."""
+        """Roll and pitch for the horizontal acceleration."""
         forward, right, _ = self._body(self.vehicle.acceleration_m_s2)
         return math.atan2(right, GRAVITY_M_S2), math.atan2(-forward, GRAVITY_M_S2)
 
     def _global_position_int(self) -> Any:
-        """It begins with the use of GPS, and does not end: without GPS it is dead reckoned."""
+        """Sent from the first use of GPS on; without GPS by dead reckoning."""
         vehicle = self.vehicle
         if not vehicle.estimator.has_used_gps:
             return None
@@ -527,7 +525,7 @@ class Px4Link:
         )
 
     def _local_position_ned(self) -> Any:
-        """From the start, and whether the estimator vouches for it or not."""
+        """Sent from the start, valid or not."""
         vehicle = self.vehicle
         return mavlink.MAVLink_local_position_ned_message(
             self._boot_ms(),
@@ -590,8 +588,6 @@ class Px4Link:
             list(self._hardware_uid.to_bytes(18, "little")),
         )
 
-    # Commands
-
     def _on_heartbeat(self, message: Any) -> None:
         if message.type == mavlink.MAV_TYPE_GCS:
             self._ground_station_at_s = self.vehicle.time_s
@@ -600,7 +596,7 @@ class Px4Link:
     def _on_command(self, message: Any) -> None:
         run = self._commands.get(message.command)
         result = MavResult.UNSUPPORTED if run is None else run(message)
-        # Two parts of PX4 take a mode, and both answer.
+        # Two modules of PX4 handle a mode command, and both answer.
         times = 2 if message.command == mavlink.MAV_CMD_DO_SET_MODE else 1
         for _ in range(times):
             self._send(
@@ -613,7 +609,7 @@ class Px4Link:
             )
 
     def _on_request_event(self, message: Any) -> None:
-        """Send again what was missed; of what is too long ago nothing is said."""
+        """Send missed events again; those too old are ignored."""
         if isinstance(message, _Message):
             first, last = message.first_sequence, message.last_sequence
         else:
@@ -624,7 +620,7 @@ class Px4Link:
                 self._send(told)
 
     def _arm_or_disarm(self, message: Any) -> MavResult:
-        """By force only the motors stop: nobody arms past the checks from outside."""
+        """Force applies to disarming only: no client can arm past the checks."""
         if message.param1 > 0.5:
             return self.vehicle.arm()
         return self.vehicle.disarm(force=message.param2 == FORCE)
@@ -656,7 +652,7 @@ class Px4Link:
         return self.vehicle.disarm(force=True) if message.param1 > 0.5 else MavResult.ACCEPTED
 
     def _set_message_interval(self, message: Any) -> MavResult:
-        """Interval in us; 0 is the default rate, below 0 is off. FAILED for HEARTBEAT."""
+        """Interval, us; 0 is the default rate, below 0 is off. FAILED for HEARTBEAT."""
         message_id, interval_us = _to_int(message.param1), message.param2
         if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT or message_id not in self._builders:
             return MavResult.FAILED
@@ -690,8 +686,6 @@ class Px4Link:
         yaw_rad = math.nan if no_yaw or not math.isfinite(message.yaw) else message.yaw
         self.vehicle.offboard(Px4Setpoint((x, y, z), (vx, vy, vz), yaw_rad))
 
-    # Parameters
-
     def _send_parameter(self, name: str) -> None:
         value = self.vehicle.parameters[name]
         if isinstance(value, int):
@@ -712,7 +706,7 @@ class Px4Link:
     def _on_param_request_read(self, message: Any) -> None:
         names = list(self.vehicle.parameters)
         if message.param_id == _CHECKSUM:
-            # Of all names and values; its bits travel in the float, too.
+            # Checksum of all names and values, encoded bytewise in the float.
             checksum = zlib.crc32(repr(sorted(self.vehicle.parameters.items())).encode())
             bits = struct.unpack("<f", struct.pack("<I", checksum))[0]
             self._send(
@@ -737,10 +731,8 @@ class Px4Link:
         parameters[name] = struct.unpack("<i" if is_int else "<f", packed)[0]
         self._send_parameter(name)
 
-    # Fence, by the mission protocol
-
     def _fence_id(self) -> int:
-        """Of what is in it; 0: there is none."""
+        """Checksum of the fence; 0 without one."""
         corners_deg = [(each.inclusion, each.vertices_deg) for each in self.vehicle.fence]
         return zlib.crc32(repr(corners_deg).encode()) if corners_deg else 0
 
@@ -833,18 +825,18 @@ class Px4Link:
 
 
 def _to_int(parameter: float) -> int:
-    """A command's parameter that should be a whole number; -1 if it is none at all."""
+    """A command's integer parameter; -1 if it is not finite."""
     return int(parameter) if math.isfinite(parameter) else -1
 
 
 def _as_integers(place: tuple[float, float, float]) -> tuple[int, int, int]:
-    """Degrees and metres as MAVLink has them: 1e-7 degrees and mm."""
+    """Degrees and metres in MAVLink's units: 1e-7 degrees and mm."""
     latitude_deg, longitude_deg, altitude_m = place
     return round(latitude_deg * 1e7), round(longitude_deg * 1e7), round(altitude_m * 1e3)
 
 
 def _to_polygons(items: list[Any]) -> tuple[FencePolygon, ...] | None:
-    """Each vertex says in param 1 how many its polygon has; None where that does not fit."""
+    """Polygons of the vertices; None if a vertex count (param 1) is inconsistent."""
     polygons: list[FencePolygon] = []
     while items:
         count = max(_to_int(items[0].param1), 0)

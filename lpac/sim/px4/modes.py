@@ -18,7 +18,7 @@ class Px4Mode(IntEnum):
     LAND = 18
 
 
-# (main mode, sub mode). Nobody can ask for DESCEND, and who looks sees LAND.
+# (main mode, sub mode). DESCEND cannot be commanded, and is reported as LAND.
 CUSTOM_MODES = {
     Px4Mode.MANUAL: (1, 0),
     Px4Mode.ALTCTL: (2, 0),
@@ -50,7 +50,7 @@ class MavResult(IntEnum):
 
 
 class FailsafeAction(IntEnum):
-    """Actions of a failsafe, the gravest last."""
+    """Actions of a failsafe, the most severe last."""
 
     NONE = 0
     WARN = 1
@@ -74,11 +74,11 @@ class FailsafeCause(StrEnum):
     POSITION_LOST = "position lost"
 
 
-# For these there is COM_FAIL_ACT_T to take over; a mode that lost what it needs is left at once.
+# These wait COM_FAIL_ACT_T for a takeover; a mode that lost its requirements is left at once.
 DELAYED = frozenset(
     {FailsafeCause.MANUAL_CONTROL_LOST, FailsafeCause.GROUND_STATION_LOST, FailsafeCause.BATTERY}
 )
-# Another mode that somebody asks for does not end these.
+# A mode command does not end these.
 NO_TAKEOVER = frozenset({FailsafeCause.OFFBOARD_LOST, FailsafeCause.POSITION_LOST})
 
 ACTION_MODES = {
@@ -88,7 +88,7 @@ ACTION_MODES = {
     FailsafeAction.LAND: Px4Mode.LAND,
     FailsafeAction.DESCEND: Px4Mode.DESCEND,
 }
-# Parameter value -> action; a value that is missing does nothing.
+# Parameter value -> action; other values do nothing.
 LINK_LOSS_ACTIONS = {
     1: FailsafeAction.HOLD,
     2: FailsafeAction.RETURN,

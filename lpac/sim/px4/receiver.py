@@ -1,4 +1,4 @@
-"""Ways in which a simulated GPS receiver tells what is not so, and its vehicle does not know."""
+"""Faults of a simulated GPS receiver that its vehicle does not know of."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ from lpac.sim.px4.vector import ZERO, Draws, level, minus, plus, times, total
 
 @dataclass(eq=False)
 class Receiver:
-    """Faults of one receiver: a test may set `stuck` and what follows at any time.
+    """Faults of one receiver; the public fields may be set at any time.
 
-    `stuck`: it repeats its last place, with a velocity of 0, as a fresh fix. `creep_m_s` is
-    how fast its places walk off, unlike what its velocity says, `velocity_bias_m_s` what its
-    velocity is wrong by, and `scatter_m` the standard deviation of its places, each by itself.
-    North, east, down.
+    `stuck`: it repeats its last position, with velocity 0, as a fresh fix. `creep_m_s` is the drift
+    rate of its position, not included in its velocity, `velocity_bias_m_s` the error of its
+    velocity, and `scatter_m` the standard deviation of independent position errors. North, east,
+    down.
     """
 
     stuck: bool = False
@@ -26,7 +26,7 @@ class Receiver:
     _stuck_at_m: Vector | None = None
 
     def step(self, dt_s: float, fix_m: Callable[[], Vector], draws: Draws) -> None:
-        """One step of time; `fix_m` gives what it would tell."""
+        """Advance by one step; `fix_m` returns the honest fix."""
         if not self.stuck:
             self._stuck_at_m = None
         elif self._stuck_at_m is None:
@@ -38,26 +38,26 @@ class Receiver:
 
     @property
     def lies(self) -> bool:
-        """Whether the place or the velocity that it tells is wrong."""
+        """Whether the reported position or velocity is wrong."""
         wrong = (self._crept_m, self._scattered_m, self.velocity_bias_m_s)
         return self._stuck_at_m is not None or wrong != (ZERO, ZERO, ZERO)
 
     def place_m(self, true_m: Vector) -> Vector:
-        """The place that it tells; `true_m` if it is honest."""
+        """The reported position; `true_m` without a fault."""
         if self._stuck_at_m is not None:
             return self._stuck_at_m
         return total(true_m, self._crept_m, self._scattered_m)
 
     def velocity_m_s(self, true_m_s: Vector) -> Vector:
-        """The velocity that it tells."""
+        """The reported velocity; `true_m_s` without a fault."""
         if self._stuck_at_m is not None:
             return ZERO
         return plus(true_m_s, self.velocity_bias_m_s)
 
     def off_m(self, true_m: Vector) -> Vector:
-        """How far its place is off in the plane. Heights go by the barometer."""
+        """Horizontal error of the reported position. Heights come from the barometer."""
         return level(minus(self.place_m(true_m), true_m))
 
     def off_m_s(self, true_m_s: Vector) -> Vector:
-        """How far its velocity is off in the plane."""
+        """Horizontal error of the reported velocity."""
         return level(minus(self.velocity_m_s(true_m_s), true_m_s))

@@ -1,4 +1,4 @@
-"""Runs simulated vehicles in real time and lets them talk over UDP, all in one thread."""
+"""Run simulated vehicles in real time over UDP, all in one thread."""
 
 import os
 import selectors
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from lpac.sim.px4.link import Px4Link
 
 STEP_S = 0.02
-# A process that was held up catches up so much; time beyond that is left out.
+# A process that was held up catches up to this much; time beyond that is skipped.
 MAX_LATENESS_S = 0.5
 
 
@@ -29,8 +29,8 @@ class Instance:
 class Px4Server:
     """A context in which the vehicles run.
 
-    Another thread that commands a vehicle, or sets more than one of its fields, holds `stepped`.
-    `started_s` is the `time.monotonic()` of the vehicles' time 0, later by what had to be left out.
+    Hold `stepped` to command a vehicle, or to set more than one of its fields. `started_s` is the
+    `time.monotonic()` of the vehicles' time 0, plus the time skipped.
     """
 
     def __init__(self, instances: Sequence[Instance]) -> None:
@@ -43,7 +43,7 @@ class Px4Server:
         self._thread = threading.Thread(target=self._run, name="px4-server")
 
     def __enter__(self) -> "Px4Server":
-        """Raises OSError if a port is taken."""
+        """Start the vehicles. Raises OSError if a port is taken."""
         for instance in self._instances:
             udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._sockets.append(udp)
@@ -63,7 +63,7 @@ class Px4Server:
         self._close()
 
     def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until `condition` holds after a step; False if that took too long."""
+        """Wait until `condition` holds after a step; False on timeout."""
         with self.stepped:
             return self.stepped.wait_for(condition, timeout_s)
 
@@ -81,7 +81,7 @@ class Px4Server:
             if now_s < next_step_s:
                 self._receive(next_step_s - now_s)
                 continue
-            # Who is always late must hear, too: for want of setpoints the vehicles would land.
+            # Receive even when always late: without setpoints the vehicles would land.
             self._receive(0.0)
             left_out_s = max(0.0, now_s - next_step_s - MAX_LATENESS_S)
             self.started_s += left_out_s
@@ -104,7 +104,7 @@ class Px4Server:
             except BlockingIOError:
                 return
             except ConnectionRefusedError:
-                # An earlier datagram found nobody listening.
+                # The client did not listen when an earlier datagram was sent.
                 continue
             link.receive(datagram)
 
@@ -118,14 +118,14 @@ class Px4Server:
         try:
             udp.sendto(datagram, ("127.0.0.1", port))
         except (BlockingIOError, ConnectionRefusedError):
-            # UDP: what nobody takes is lost.
+            # UDP: datagrams without a receiver are lost.
             return
 
 
 def _run_before_all_others() -> None:
-    """This thread, where the system allows it: an autopilot has a processor of its own.
+    """Give this thread real-time priority, if allowed: a real autopilot has its own processor.
 
-    Without it a busy machine's vehicles fall silent, which theirs never do.
+    Otherwise vehicles would fall silent on a busy machine, which real ones never do.
     """
     if sys.platform == "linux":
         with suppress(OSError):

@@ -1,11 +1,11 @@
 """A PX4-like multicopter: modes, refusals, failsafes and flight; no socket and no clock.
 
-World frame: north, east, down from `WorldOrigin`, m; the ground is at down = 0. The vehicle knows
-its position with an error: a GPS bias and slow noise, and with `Errors` much more. Its local frame
-starts at the estimator's origin, which is neither the launch point nor its height.
+World frame: north, east, down from `WorldOrigin`, m; the ground is at down = 0. The estimated
+position has a GPS bias and slow noise, and with `Errors` many more errors. The local frame starts
+at the estimator's origin, which differs from the launch point in the plane and in height.
 
-Times of the estimator, of checks and of failsafes are those that a real PX4 v1.17 was seen with, by
-its own clock: tests/sim/sim/test_px4_recordings.py compares them.
+Times of estimator, checks and failsafes are those measured with a real PX4 v1.17, on its own clock:
+tests/sim/sim/test_px4_recordings.py compares them.
 """
 
 import math
@@ -53,16 +53,16 @@ from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
 GRAVITY_M_S2 = 9.81
-# All motors at full thrust, and the air's drag on what sinks: as in PX4's own simulator.
+# Full thrust, and drag on a sinking vehicle, as in PX4's own simulator.
 GREATEST_LIFT_M_S2, SINKING_DRAG_PER_S = 20.0, 1.0
-# Share of the wind that its change pushes the vehicle with, 1/s, and how soon control makes up.
+# Acceleration per uncompensated wind, 1/s, and the time constant of its compensation.
 DRAG_PER_S = 0.3
 WIND_COMPENSATION_S = 5.0
 CHECKS_PERIOD_S = 0.1
 SENSOR_TIMEOUT_S = 1.0
 BATTERY_TIMEOUT_S = 5.0
-# After disarming: the log ends, and the estimator finds that nothing moves. After arming: it finds
-# that something does.
+# Times after disarming at which the log ends and the estimator detects rest; time after arming at
+# which it detects motion.
 LOG_ENDS_S = 3.4
 AT_REST_AFTER_S = 2.3
 MOVES_AFTER_S = 0.5
@@ -73,29 +73,29 @@ LANDED_AFTER_S = 1.0
 IN_AIR_AFTER_S = 0.9
 STOPPED_M_S = 0.5
 ARRIVED_M = 0.3
-# Above so much the velocity's estimate errs as in flight.
+# Height from which on the estimated velocity has its full error.
 _ERRS_FROM_M = 1.0
 SLOW_DESCENT_BELOW_M = 5.0
 TRUTH_PERIOD_S = 0.04
-# Four cells: empty, and from there to full. What motors take, and all else.
+# Voltage of four empty cells, and its rise to full; current of the motors, and of all else.
 EMPTY_V, FULL_ABOVE_EMPTY_V = 14.0, 2.8
 HOVER_A, IDLE_A = 12.0, 0.5
-# What PX4 takes the pack's resistance for.
+# The battery's resistance as PX4 assumes it.
 ASSUMED_OHM = 0.02
-# What the receiver of PX4's own simulator says of itself.
+# Accuracy and satellites of the receiver in PX4's own simulator.
 GPS_ACCURACY_M, GPS_ACCURACY_M_S, GPS_SATELLITES = (0.9, 1.78), 0.4, 10
-# No receiver tells the same place twice.
+# Real receivers never repeat a position exactly.
 FIX_NOISE_M, FIX_NOISE_RAD_S = 0.02, (7.3, 9.1, 5.7)
-# How old a fix is when it is told.
+# Age of a fix when it is sent.
 GPS_LAG_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Airframe:
-    """How the vehicle answers to commands.
+    """Dynamics of the vehicle.
 
-    `offboard_velocity_lag_s` holds for bare velocity setpoints: 1 m/s for 10 s covers 8.7 m, as
-    measured. PX4's own modes also feed the acceleration forward and answer within `lag_s`.
+    `offboard_velocity_lag_s` is for pure velocity setpoints: 1 m/s for 10 s covers 8.7 m, as
+    measured. PX4's own modes also feed the acceleration forward and respond within `lag_s`.
     """
 
     lag_s: float = 0.3
@@ -117,7 +117,7 @@ class Px4Setpoint:
 
 
 class SimulatedSensor(StrEnum):
-    """Sensor that can fail, or whose driver can."""
+    """Sensor that can fail, or with a driver that can."""
 
     GPS = "gps"
     BAROMETER = "barometer"
@@ -134,7 +134,7 @@ _BY_COMMAND, _BY_LANDING, _BEFORE_FLIGHT, _BY_FAILSAFE = 4, 6, 7, 14
 _ARMING_DENIED, _DISARMING_DENIED = 133277, 9091509
 _TAKEOFF_DETECTED, _LANDING_DETECTED, _LANDING_ORDERED = 4277609, 9844908, 3322590
 _FUSION_STOPPED, _FUSION_STARTED = 14699175, 15292483
-# Each with a cause, and without.
+# Event numbers with a cause, and without.
 _FAILSAFE_ACTS, _FAILSAFE_HOLDS, _FAILSAFE_WARNS = (
     (9751178, 14605264),
     (13704694, 4502496),
@@ -151,7 +151,7 @@ _ACTIONS = {
     FailsafeAction.DESCEND: 8,
     FailsafeAction.STOP_MOTORS: 10,
 }
-# A member of an enum takes ten times as long to look up; this one, 400 times a second.
+# Looking up an enum member takes ten times as long, and this one is used 400 times a second.
 _NONE = FailsafeAction.NONE
 _CAUSES = {FailsafeCause.MANUAL_CONTROL_LOST: 1, FailsafeCause.GROUND_STATION_LOST: 2}
 
@@ -159,9 +159,9 @@ _CAUSES = {FailsafeCause.MANUAL_CONTROL_LOST: 1, FailsafeCause.GROUND_STATION_LO
 class Truth(NamedTuple):
     """True state at one time: world frame, m and m/s.
 
-    `setpoint_at_s` is when the last setpoint came, -inf before the first, and `follows` what it
-    asked for: a stop is a velocity of zero in the plane. `velocity_error_m_s` is how wrong its
-    estimate of the horizontal velocity is, and `commands` how many commands have been sent to it.
+    `setpoint_at_s` is the time of the last setpoint, -inf before the first, and `follows` its kind:
+    a stop is a horizontal velocity of zero. `velocity_error_m_s` is the error of the estimated
+    horizontal velocity, and `commands` the number of commands received.
     """
 
     time_s: float
@@ -179,18 +179,15 @@ class Truth(NamedTuple):
 class Px4Vehicle:
     """One vehicle; deterministic for a seed, its steps and its commands.
 
-    Fields that a test may set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard
-    deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `gps_jump_m`
-    (its fix is off by that much at once, and the estimator must see what to make of it, as of the
-    other faults of its `receiver`),
-    `gps_offset_m` and `gps_drift_m_s` (what fix and estimate are off besides, and how that
-    goes on; no bound keeps it), `compass_jump_rad`,
-    `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
-    and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
-    any more), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (the share of its thrust
-    that is lost in flight: above 0.51 the vehicle sinks), `wire` (what becomes of its messages).
-    `thrust` is the share of the greatest one that its motors are asked for. `truth` grows by one
-    entry every 0.04 s.
+    Fields that may be set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard deviation),
+    `gps_bias_m`, `gps_lost` (the receiver runs, without satellites), `gps_jump_m` (sudden error of
+    the fix, which the estimator may reject or follow, as the other faults of its `receiver`),
+    `gps_offset_m` and `gps_drift_m_s` (error that fix and estimate share, and its unbounded rate),
+    `compass_jump_rad`, `gps_told_m` (reported accuracy, instead of the receiver's own),
+    `estimate_frozen` (old position and velocity are sent on), `dead_sensors` (their drivers are
+    silent), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (share of thrust lost in
+    flight: above 0.51 the vehicle sinks), `wire` (faults of its messages). `thrust` is the
+    commanded share of full thrust. `truth` grows by one entry every 0.04 s.
     """
 
     def __init__(
@@ -204,11 +201,11 @@ class Px4Vehicle:
         ready_after_s: float | None = None,
         errors: Errors | None = None,
     ) -> None:
-        """`start_m` is north and east. Health becomes good `ready_after_s` after the start.
+        """`start_m` is north and east. Checks pass `ready_after_s` after the start.
 
-        It is drawn from 3 to 6 s unless given; so are the GPS bias, 1 to 5 m horizontally, and the
-        place of the estimator's origin. Without `errors` the bias stays as it is, the compass is
-        right, the air stands still and a voltage does not sag.
+        It is drawn from 3 to 6 s unless given. The GPS bias, 1 to 5 m horizontally, and the
+        estimator's origin are always drawn. Without `errors` the bias is constant, the compass is
+        exact, there is no wind and the voltage does not sag.
         """
         rng = np.random.default_rng(seed)
         self._world = origin or WorldOrigin()
@@ -274,7 +271,7 @@ class Px4Vehicle:
 
     @property
     def position_m(self) -> F64:
-        """(3,), world frame: where the vehicle is. It may be set."""
+        """(3,), world frame: true position. It may be set."""
         return np.array(self._position_m)
 
     @position_m.setter
@@ -283,14 +280,12 @@ class Px4Vehicle:
 
     @property
     def velocity_m_s(self) -> F64:
-        """(3,), world frame."""
+        """(3,), world frame: true velocity."""
         return np.array(self._velocity_m_s)
-
-    # What the vehicle believes
 
     @property
     def estimated_position_m(self) -> F64:
-        """(3,), world frame: where the vehicle takes itself to be."""
+        """(3,), world frame: estimated position."""
         return np.array(self.estimate_m())
 
     def estimate_m(self) -> Vector:
@@ -301,7 +296,7 @@ class Px4Vehicle:
 
     @property
     def estimated_velocity_m_s(self) -> F64:
-        """(3,), world frame: how fast the vehicle takes itself to be."""
+        """(3,), world frame: estimated velocity."""
         return np.array(self.estimate_m_s())
 
     def estimate_m_s(self) -> Vector:
@@ -317,25 +312,25 @@ class Px4Vehicle:
 
     @property
     def local_position_m(self) -> F64:
-        """(3,): the estimate from the estimator's origin, north, east, down."""
+        """(3,): estimated position from the estimator's origin, north, east, down."""
         return self.estimated_position_m - self.estimator_origin_m
 
     @property
     def global_position(self) -> tuple[float, float, float]:
-        """The estimate: latitude and longitude, deg, height above mean sea level, m."""
+        """Estimated latitude and longitude, deg, and height above mean sea level, m."""
         return self._world.to_global(self.estimate_m())
 
     @property
     def global_fix(self) -> tuple[float, float, float]:
         """The receiver's position: latitude and longitude, deg, and height, m.
 
-        It errs as the estimate does, which follows it, and has noise besides; it comes late.
+        It has the error of the estimate, which follows it, plus noise, and it is late.
         """
         return self._world.to_global(self.receiver.place_m(self._honest_fix_m()))
 
     @property
     def fix_velocity_m_s(self) -> Vector:
-        """World frame: how fast the receiver says to move."""
+        """World frame: the receiver's velocity."""
         return self.receiver.velocity_m_s(self._velocity_m_s)
 
     def _honest_fix_m(self) -> Vector:
@@ -364,7 +359,7 @@ class Px4Vehicle:
 
     @property
     def gps_satellites(self) -> int:
-        """How many the receiver sees, if it sees any."""
+        """Number of satellites, while the receiver has a fix."""
         return GPS_SATELLITES if self._errors is None else self._errors.satellites(self.time_s)
 
     @property
@@ -374,21 +369,21 @@ class Px4Vehicle:
 
     @property
     def global_home(self) -> tuple[float, float, float] | None:
-        """Home in the same terms, None before there is one."""
+        """Home as latitude, longitude, deg, and height, m; None if not set."""
         return None if self.home_m is None else self._world.to_global(self.home_m)
 
     @property
     def position_valid(self) -> bool:
-        """Whether the estimator vouches for its position."""
+        """Whether the estimated position is valid."""
         return self.estimator.position_valid
 
     def silent_s(self, sensor: SimulatedSensor) -> float:
-        """For how long a driver has been dead; below 0 if it is not."""
+        """How long a sensor's driver has been dead, s; below 0 if it is not."""
         return self.time_s - self._dead_since_s.get(sensor, math.inf)
 
     @property
     def at_rest(self) -> bool:
-        """Whether the estimator holds its position since nothing moves."""
+        """Whether the estimator detects that the vehicle is at rest."""
         if self.armed:
             return self.time_s - self._armed_at_s < MOVES_AFTER_S
         return self._disarmed_at_s is None or self.time_s - self._disarmed_at_s > AT_REST_AFTER_S
@@ -400,19 +395,19 @@ class Px4Vehicle:
 
     @property
     def current_a(self) -> float:
-        """Current that the battery gives."""
+        """Current of the battery, A."""
         loss = 0.0 if self._errors is None else self._errors.thrust_loss
         return IDLE_A + (HOVER_A * (1.0 + loss) if self.armed and not self.landed else 0.0)
 
     @property
     def voltage_v(self) -> float:
-        """Of the whole battery, as it is under its load."""
+        """Voltage of the whole battery under load, V."""
         sag_v = 0.0 if self._errors is None else self.current_a * self._errors.resistance_ohm
         return EMPTY_V + FULL_ABOVE_EMPTY_V * self.battery_remaining - sag_v
 
     @property
     def battery_told(self) -> float:
-        """PX4's estimate of the charge, 0 to 1: by a voltage that sags more than it knows."""
+        """PX4's estimate of the charge, 0 to 1; too low if the voltage sags more than assumed."""
         if self._errors is None:
             return self.battery_remaining
         unknown_v = self.current_a * (self._errors.resistance_ohm - ASSUMED_OHM)
@@ -420,7 +415,7 @@ class Px4Vehicle:
 
     @property
     def rc_heard(self) -> bool:
-        """Whether somebody's remote control is on, and listened to."""
+        """Whether a remote control is received, and enabled."""
         is_stale = self._errors is not None and self._errors.is_remote_control_stale(self.time_s)
         return self.rc_connected and not is_stale and not self._no_manual_control
 
@@ -430,7 +425,7 @@ class Px4Vehicle:
 
     @property
     def battery_warning(self) -> int:
-        """MAV_BATTERY_CHARGE_STATE: 1 is well, 2 low, 3 critical, 4 emergency."""
+        """MAV_BATTERY_CHARGE_STATE: 1 is ok, 2 low, 3 critical, 4 emergency."""
         told, parameters = self.battery_told, self.parameters
         if told >= parameters["BAT_LOW_THR"]:
             return 1
@@ -438,7 +433,7 @@ class Px4Vehicle:
 
     @property
     def armable(self) -> bool:
-        """Whether the checks before arming pass, in the mode that is set."""
+        """Whether the arming checks pass in the current mode."""
         return self._checks().can_arm(self.mode)
 
     def take_events(self) -> list[Px4Event]:
@@ -449,10 +444,8 @@ class Px4Vehicle:
     def _say(self, number: int, level: Level, text: str = "", arguments: bytes = b"") -> None:
         self._events.append(Px4Event(number, level, arguments, text, level))
 
-    # What a client commands
-
     def arm(self, *, force: bool = False) -> MavResult:
-        """Arm; TEMPORARILY_REJECTED unless every check passes or, as no client can, by force."""
+        """Arm; TEMPORARILY_REJECTED if a check fails. Clients cannot set `force`."""
         if self.armed:
             return MavResult.ACCEPTED
         self._run_checks()
@@ -472,7 +465,7 @@ class Px4Vehicle:
         return MavResult.ACCEPTED
 
     def disarm(self, *, force: bool = False, reason: int = _BY_COMMAND) -> MavResult:
-        """Disarm; TEMPORARILY_REJECTED in the air, unless by force: then the vehicle falls."""
+        """Disarm; TEMPORARILY_REJECTED in the air without `force`, with which the vehicle falls."""
         if not self.armed:
             return MavResult.ACCEPTED
         if not self.landed and not force:
@@ -487,10 +480,10 @@ class Px4Vehicle:
         return MavResult.ACCEPTED
 
     def set_mode(self, mode: Px4Mode) -> MavResult:
-        """Ask for a mode: it is on after the next step.
+        """Command a mode, which is set in the next step.
 
-        TEMPORARILY_REJECTED in the air, where the vehicle lacks what the mode needs. LAND is always
-        taken: without a position the vehicle descends.
+        TEMPORARILY_REJECTED while armed, if a requirement of the mode is missing. LAND is always
+        accepted: without a position the vehicle descends.
         """
         if self.armed and mode is not Px4Mode.LAND:
             self._run_checks()
@@ -506,7 +499,7 @@ class Px4Vehicle:
         return MavResult.ACCEPTED
 
     def run_prearm_checks(self) -> MavResult:
-        """Run the checks before arming and tell all that they find."""
+        """Run the arming checks and report all problems."""
         self._run_checks(asked=True)
         return MavResult.ACCEPTED
 
@@ -518,19 +511,17 @@ class Px4Vehicle:
         return result
 
     def offboard(self, setpoint: Px4Setpoint) -> None:
-        """A setpoint of the stream that OFFBOARD needs."""
+        """Receive a setpoint of the stream that OFFBOARD needs."""
         self._setpoint, self._setpoint_at_s = setpoint, self.time_s
 
     def ground_station_heartbeat(self) -> None:
-        """A ground station was heard."""
+        """Receive a ground station's heartbeat."""
         self._ground_station_at_s = self.time_s
-
-    # What a test does to it
 
     def pilot(
         self, mode: Px4Mode = Px4Mode.POSCTL, stick_velocity_m_s: Sequence[float] = ()
     ) -> MavResult:
-        """A pilot switches on the remote control, to `mode`, and holds the sticks.
+        """Switch the remote control on, with this mode and these sticks.
 
         `stick_velocity_m_s` is north, east, down; empty means centred.
         """
@@ -540,11 +531,11 @@ class Px4Vehicle:
         return result
 
     def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
-        """Sticks alone take the vehicle only where COM_RC_OVERRIDE allows it."""
+        """Move the sticks; they take over the vehicle only if COM_RC_OVERRIDE allows it."""
         north, east, down = velocity_m_s or ZERO
         self._sticks_m_s = north, east, down
         if self.mode in PILOTED:
-            # It stays where the sticks are let go, not where they were let go before.
+            # Hold the position at which the sticks are released now, not an earlier one.
             self._hold_m = None
         bit = 2 if self.mode is Px4Mode.OFFBOARD else 1
         override = int(self.parameters["COM_RC_OVERRIDE"]) & bit
@@ -552,13 +543,11 @@ class Px4Vehicle:
             self.set_mode(Px4Mode.POSCTL)
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
-        """The estimator starts over from another origin: local positions jump, global ones stay."""
+        """Reset the estimator to another origin: local positions jump, global ones stay."""
         self.estimator_origin_m = plus(self.estimator_origin_m, (north_m, east_m, down_m))
 
-    # Time
-
     def step(self, dt_s: float) -> None:
-        """One step of time; 0.02 s suits the model."""
+        """Advance by one step; 0.02 s suits the model."""
         if not self.estimate_frozen:
             self._frozen = None
         elif self._frozen is None:
@@ -577,7 +566,7 @@ class Px4Vehicle:
             self._compass_rad = self._errors.heading_rad(self.time_s) + self.compass_jump_rad
             self._air_m_s = plus(self._air_m_s, self._errors.wind_m_s(self.time_s))
             lifted = min(-self._position_m[2] / _ERRS_FROM_M, 1.0)
-            # Who stands on the ground is known to.
+            # On the ground PX4 knows that it does not move.
             if lifted > 0.0:
                 errors_m_s = times(self._errors.velocity_m_s(self.time_s), lifted)
                 self._velocity_error_m_s = plus(self._velocity_error_m_s, errors_m_s)
@@ -623,8 +612,6 @@ class Px4Vehicle:
             sensor: self._dead_since_s.get(sensor, self.time_s) for sensor in self.dead_sensors
         }
 
-    # Checks
-
     def _run_checks(self, *, asked: bool = False) -> None:
         used_gps = Component.GPS in self._reporter.newest.present
         self._events += self._reporter.update(self._checks(), self.time_s, asked=asked)
@@ -637,7 +624,7 @@ class Px4Vehicle:
             self._say(number, Level.INFO, text)
 
     def _checks(self) -> HealthReport:
-        """All that is wrong now, in PX4's order."""
+        """All current problems, in PX4's order."""
         parameters = self.parameters
         rc_heard, ground_station_lost = self.rc_heard, self._ground_station_lost()
         position_valid = self.estimator.position_valid
@@ -655,7 +642,7 @@ class Px4Vehicle:
         if not ground_station_lost:
             is_there.add(Component.COMMUNICATION_LINKS)
         required = int(parameters["NAV_DLL_ACT"]) > 0
-        # In flight a battery does not get better.
+        # In flight the battery warning never decreases.
         self._battery_warning = max(
             self.battery_warning, self._battery_warning if self.armed else 1
         )
@@ -688,10 +675,8 @@ class Px4Vehicle:
         problems: list[ArmingProblem] = [p for is_so, p in found if is_so and p is not None]
         return HealthReport(tuple(problems), frozenset(is_there))
 
-    # Modes
-
     def _offboard_signal(self) -> bool:
-        """Whether setpoints come, and the vehicle knows what it needs to follow them."""
+        """Whether setpoints are fresh, and the position to follow them is valid."""
         fresh = self.time_s - self._setpoint_at_s <= self.parameters["COM_OF_LOSS_T"]
         return fresh and self.estimator.position_valid
 
@@ -804,7 +789,7 @@ class Px4Vehicle:
         return FailsafeAction.WARN if is_silent else _NONE
 
     def _on_geofence(self) -> FailsafeAction:
-        """A breach acts until another mode is asked for; then not until the next breach."""
+        """A breach acts until a mode is commanded; after that, only at the next breach."""
         outside = self._is_outside_fence()
         if outside and not self._outside_fence:
             self._fence_latch = self._mode_commands
@@ -831,8 +816,6 @@ class Px4Vehicle:
         lost = self.intended_mode in NEED_POSITION and not self.estimator.position_valid
         return FailsafeAction.DESCEND if lost else _NONE
 
-    # Motion
-
     def _home_down_m(self) -> float:
         home_m = self.estimate_m() if self.home_m is None else self.home_m
         return home_m[2]
@@ -848,7 +831,7 @@ class Px4Vehicle:
         if on_ground and to_down >= 0.0:
             to_north = to_east = to_down = 0.0
         parameters = self.parameters
-        # Level, it is the air that slows it, whatever it takes its velocity to be.
+        # A level vehicle is slowed by the air, whatever its estimated velocity.
         is_level = self.mode is Px4Mode.DESCEND
         error_m_s = ZERO if is_level else self._velocity_error_m_s
         v_north, v_east, v_down = plus(self._velocity_m_s, error_m_s)
@@ -856,13 +839,13 @@ class Px4Vehicle:
             (to_north - v_north) / lag_s, (to_east - v_east) / lag_s, parameters["MPC_ACC_HOR"]
         )
         if self._compass_rad:
-            # It takes its nose to be where it is not, and so pushes the wrong way.
+            # With a wrong heading it accelerates in the wrong direction.
             cos, sin = math.cos(self._compass_rad), math.sin(self._compass_rad)
             north, east = cos * north + sin * east, cos * east - sin * north
         acceleration = north, east, self._lift(to_down, v_down)
         unmet_m_s = minus(self._air_m_s, self._compensated_wind_m_s)
         if not on_ground:
-            # However slowly it follows a command, it holds against a push as ever.
+            # Its resistance to wind does not depend on the lag of its commands.
             pushed = times(unmet_m_s, DRAG_PER_S * self._airframe.lag_s / lag_s)
             acceleration = plus(acceleration, pushed)
         makes_up_m_s = times(unmet_m_s, dt_s / WIND_COMPENSATION_S)
@@ -873,7 +856,7 @@ class Px4Vehicle:
         self._advance(dt_s)
 
     def _lift(self, to_down: float, v_down: float) -> float:
-        """The acceleration downwards that the motors leave; sets the thrust they are asked for."""
+        """The resulting downward acceleration; also sets the commanded thrust."""
         parameters = self.parameters
         built_in_loss = 0.0 if self._errors is None else self._errors.thrust_loss
         power = 1.0 - max(built_in_loss, self.motor_loss)
@@ -885,7 +868,7 @@ class Px4Vehicle:
         stands = self._position_m[2] >= 0.0 and self._lift_began_s is None
         wanted_lift = 0.0 if stands else GRAVITY_M_S2 - wanted
         self.thrust = min(wanted_lift / max(full_lift, 1e-9), 1.0)
-        # A vehicle that lifts too little sinks, against the air's drag.
+        # With too little lift the vehicle sinks, against drag.
         return max(wanted, GRAVITY_M_S2 - full_lift - SINKING_DRAG_PER_S * max(v_down, 0.0))
 
     def _fall(self, dt_s: float) -> None:
@@ -911,7 +894,7 @@ class Px4Vehicle:
         self.heading_rad = (self.heading_rad + self.yaw_rate_rad_s * dt_s) % math.tau
 
     def _limit(self, command: Vector) -> Vector:
-        """The vehicle's own speed limits, the ramp of a takeoff, and what the wind leaves."""
+        """Limit a command by PX4's speed limits, the takeoff ramp, and the airspeed in wind."""
         parameters = self.parameters
         north, east = _shorten(command[0], command[1], parameters["MPC_XY_VEL_MAX"])
         wind_north, wind_east, _ = self._air_m_s
@@ -943,7 +926,7 @@ class Px4Vehicle:
             return ZERO, math.nan, lag_s
         wind_north, wind_east, _ = self._air_m_s
         if self.mode is Px4Mode.DESCEND:
-            # Level, it is carried along by the air as fast as that drags it.
+            # A level vehicle drifts with the wind, as fast as drag allows.
             descent = wind_north, wind_east, self.parameters["MPC_LAND_SPEED"]
             return descent, math.nan, 1.0 / DRAG_PER_S
         if self.mode is Px4Mode.OFFBOARD and self._setpoint is not None:
@@ -978,7 +961,7 @@ class Px4Vehicle:
         return (north, east, down), setpoint.yaw_rad, lag_s
 
     def _hold(self) -> Vector:
-        """Brake, then stay where the vehicle came to rest."""
+        """Brake, then hold the position of rest."""
         if self._hold_m is None:
             north, east, _ = plus(self._velocity_m_s, self._velocity_error_m_s)
             if math.hypot(north, east) > STOPPED_M_S:
@@ -1021,8 +1004,6 @@ class Px4Vehicle:
         gain, gain_down = self.parameters["MPC_XY_P"], self.parameters["MPC_Z_P"]
         north, east = _shorten(gain * off_north, gain * off_east, self.parameters["MPC_XY_CRUISE"])
         return north, east, gain_down * off_down
-
-    # Ground
 
     def _watch_ground(self) -> None:
         if self._position_m[2] < 0.0:
@@ -1081,7 +1062,7 @@ class Px4Vehicle:
 
 
 def _axis(velocity_m_s: float, error_m: float, gain: float, drift_m_s: float) -> float:
-    """A setpoint along one axis, where a NaN asks for nothing."""
+    """Velocity of a setpoint along one axis; NaN parts are not commanded."""
     feed_m_s = 0.0 if math.isnan(velocity_m_s) else velocity_m_s
     return feed_m_s + (drift_m_s if math.isnan(error_m) else gain * error_m)
 

@@ -9,10 +9,10 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class MavlinkWire:
-    """`loss` is the share that is lost, either way; 1 is a wire that is cut.
+    """`loss` is the share of lost messages, in either direction; 1 is a cut wire.
 
-    Of what the vehicle says, the share `late` comes late, and the share `twice` comes at once and
-    late, by a time drawn from `late_s`.
+    Of the vehicle's messages the share `late` is delayed, and the share `twice` arrives both at
+    once and delayed, by a time drawn from `late_s`.
     """
 
     loss: float = 0.0
@@ -22,7 +22,7 @@ class MavlinkWire:
 
 
 class OnTheWire:
-    """Delayed messages. Deterministic for a seed and what is sent."""
+    """Messages in transit. Deterministic for a seed and the messages sent."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
@@ -30,7 +30,7 @@ class OnTheWire:
         self._count = 0
 
     def is_lost(self, wire: MavlinkWire) -> bool:
-        """Whether the next message is."""
+        """Draw whether the next message is lost."""
         return wire.loss > 0.0 and self._random.random() < wire.loss
 
     def pass_on(self, said: Sequence[Any], wire: MavlinkWire, now_s: float) -> list[Any]:

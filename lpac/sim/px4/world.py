@@ -1,4 +1,4 @@
-"""Position of the simulated world on the earth, and polygons on it."""
+"""Geographic origin of the simulated world, and fence polygons."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class WorldOrigin(NamedTuple):
 class FencePolygon:
     """Inclusion or exclusion polygon of PX4's geofence: (latitude, longitude) in deg, in order.
 
-    Each is its own: to compare their corners fifty times a second costs more than all else here.
+    Compared and hashed by identity: comparing vertices fifty times a second would be too slow.
     """
 
     inclusion: bool
@@ -58,6 +58,6 @@ class FencePolygon:
 def _edges_m(
     polygon: FencePolygon, world: WorldOrigin
 ) -> tuple[tuple[tuple[float, float], tuple[float, float]], ...]:
-    """From corner to corner, each north and east."""
+    """Edges as pairs of corners, each north and east."""
     corners_m = [world.to_world(*vertex_deg) for vertex_deg in polygon.vertices_deg]
     return tuple(zip(corners_m, corners_m[1:] + corners_m[:1], strict=True))

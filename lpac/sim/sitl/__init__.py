@@ -1,1 +1,1 @@
-"""A real PX4, built by whoever has one, as the vehicles of a simulated fleet."""
+"""Real PX4 builds (SITL) as the vehicles of a simulated fleet."""

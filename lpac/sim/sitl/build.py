@@ -1,9 +1,8 @@
-"""Real PX4s, as a build of PX4's simulator (`make px4_sitl`) makes them: software in the loop with
-PX4's own vehicle model (SIH); v1.14 and later.
+"""Real PX4s from a SITL build (`make px4_sitl`) with PX4's own vehicle model (SIH), from v1.14 on.
 
-Instance i listens on UDP port 14580 + i, sends to 14540 + i, hears a ground station on 18570 + i,
-and tells where its vehicle really is (HIL_STATE_QUATERNION) on 19410 + i. Those beyond the tenth
-would all send to one port. What really happened is in PX4's log, which is read in the end.
+Instance i listens on UDP port 14580 + i, sends to 14540 + i, receives a ground station on
+18570 + i, and sends the vehicle's true state (HIL_STATE_QUATERNION) to 19410 + i. Those beyond the
+tenth would all send to one port. The true flight is read from PX4's log at the end.
 """
 
 import fcntl
@@ -48,11 +47,10 @@ _AIRBORNE_ABOVE_M = 0.15
 _STOP_WITHIN_S = 3.0
 _HEARD_WITHIN_S = 30.0
 _MODEL, _AIRFRAME = "sihsim_quadx", "10040"
-# All is logged, from the start to the end. And two calibrations are off that change their pace as
-# the vehicle is armed: on a computer with threads, PX4's list of timers loses its tail if that
-# happens in the wrong moment, and with it every simulated sensor, for good (seen with v1.17 in one
-# arming of four). And its battery lasts 20 minutes, as the simulated vehicle's: PX4's own is half
-# empty after half a minute, and a robot that measures that goes home.
+# Log everything from start to end. Two calibrations that change their rate on arming are off: on a
+# multithreaded computer PX4's list of timers can then lose its tail, and with it all simulated
+# sensors, for good (v1.17, in one arming of four). The battery lasts 20 minutes, as the simulated
+# vehicle's: PX4's default is half empty after half a minute, on which robots return.
 _PARAMETERS = {
     "SIM_BAT_DRAIN": "1200",
     "SDLOG_MODE": "2",
@@ -60,9 +58,9 @@ _PARAMETERS = {
     "IMU_GYRO_CAL_EN": "0",
     "SENS_MAG_AUTOCAL": "0",
 }
-# Sourced from PATH by v1.14; newer ones take PX4_PARAM_* from the environment.
+# v1.14 sources it from PATH; newer versions read PX4_PARAM_* from the environment.
 _PARAMETERS_SCRIPT = "px4-rc.params"
-# What PX4 keeps from one start to the next: a flight begins with the factory's settings.
+# State that PX4 keeps between starts; deleted, so that a flight begins with default parameters.
 _KEPT_FILES = ("parameters.bson", "parameters_backup.bson", "dataman", "eeprom/parameters")
 _CLOCK_PERIOD_S = 0.1
 _MAVLINK_2, _HEADER_BYTES, _FRAME_BYTES = 0xFD, 10, 12
@@ -79,9 +77,9 @@ class _Place(NamedTuple):
 
 @dataclass(slots=True)
 class _Instance:
-    """One PX4: its program, and what is heard of its vehicle.
+    """One PX4: its process, and the received states of its vehicle.
 
-    `clock` are pairs of `time.monotonic()` and PX4's time, s.
+    `clock` has pairs of `time.monotonic()` and PX4's time, s.
     """
 
     number: int
@@ -107,25 +105,25 @@ class _Instance:
         return sorted(path for path in found if path.stat().st_mtime >= self.started_unix_s)
 
     def ending(self) -> str:
-        """How PX4 has ended, and what it said last."""
+        """How PX4 has ended, and its last line of output."""
         assert self.process is not None and self.process.returncode is not None
         code = self.process.returncode
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         return f"{how}: {self.last_words()}"
 
     def last_words(self) -> str:
-        """The last line of px4.log, of those that tell of an error if there are any."""
+        """The last error in px4.log, or its last line without one."""
         log = self.folder / "px4.log"
         text = re.sub(r"\x1b\[[0-9;]*m", "", log.read_text(errors="replace"))
         lines = [line.strip() for line in text.splitlines() if line.strip()]
-        # Each PX4 lacks some parameter that its script knows; and a script that fails says so last.
+        # Unknown parameters are harmless, and a failing script always reports so last.
         errors = [
             line
             for line in lines
             if line.startswith("ERROR") and "Parameter" not in line and "Startup script" not in line
         ]
         last = [*lines[-1:], *errors[-1:]]
-        return f"{last[-1]} (see {log})" if last else "it said nothing"
+        return f"{last[-1]} (see {log})" if last else "it printed nothing"
 
 
 class Px4Build:
@@ -138,7 +136,7 @@ class Px4Build:
         world: WorldOrigin,
         folder: Path,
     ) -> None:
-        """`starts_m` are north and east in the world; each instance works in a folder of `folder`.
+        """`starts_m` are north and east in the world; each instance runs in a folder in `folder`.
 
         Raises ValueError if `build` is no build of PX4's simulator, or there are too many starts,
         VehicleError if an older PX4 still runs, or a port is taken.
@@ -171,7 +169,7 @@ class Px4Build:
         self._degrees_1e7 = _start_is_in_degrees_1e7(build)
 
     def __enter__(self) -> Self:
-        """Raises VehicleError if a port is taken."""
+        """Start all instances. Raises VehicleError if a port is taken."""
         with ExitStack() as stack:
             stack.enter_context(self._selector)
             for instance in self._instances:
@@ -195,7 +193,7 @@ class Px4Build:
         self._stack.close()
 
     def require_running(self) -> None:
-        """Raises VehicleError if a PX4 has ended, or its vehicle is not heard."""
+        """Raise VehicleError if a PX4 has ended, or does not send its vehicle's state."""
         for instance in self._instances:
             process = instance.process
             if process is not None and process.poll() is not None:
@@ -204,23 +202,23 @@ class Px4Build:
                 heard = bool(instance.places)
             if not heard and time.monotonic() - instance.started_s > _HEARD_WITHIN_S:
                 raise VehicleError(
-                    f"the PX4 of r{instance.number} tells nothing of its vehicle after "
+                    f"the PX4 of r{instance.number} has not sent its vehicle's state within "
                     f"{_HEARD_WITHIN_S:g} s: {instance.last_words()}"
                 )
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """Tracks by PX4's own log, once PX4 has ended; by its messages, where there is no log."""
+        """Tracks from PX4's own logs, once PX4 has ended; from its messages without a log."""
         return tuple(self._track(instance) for instance in self._instances)
 
     def forget(self) -> None:
-        """Keep of each only where it is."""
+        """Drop the history of each vehicle."""
         with self._heard_lock:
             for instance in self._instances:
                 del instance.places[:-1]
                 del instance.clock[1:-1]
 
     def lost_s(self) -> float:
-        """By how much the slowest PX4's clock fell behind real time, s."""
+        """Lateness of the slowest PX4's clock, s."""
         with self._heard_lock:
             clocks = [(i.clock[0], i.clock[-1]) for i in self._instances if i.clock]
         lost_s = [
@@ -230,7 +228,7 @@ class Px4Build:
         return max(0.0, *lost_s, 0.0)
 
     def stood_still_s(self, since_s: float) -> float:
-        """The longest that one PX4's clock stood still at once, since then (`time.monotonic()`)."""
+        """Longest standstill of a PX4's clock since then (`time.monotonic()`), s."""
         longest_s = 0.0
         with self._heard_lock:
             for instance in self._instances:
@@ -240,12 +238,12 @@ class Px4Build:
         return longest_s
 
     def pids(self) -> list[int]:
-        """The processes of the PX4s that run."""
+        """Process ids of the running PX4s."""
         processes = [instance.process for instance in self._instances]
         return [p.pid for p in processes if p is not None and p.poll() is None]
 
     def _track(self, instance: _Instance) -> TrueTrack:
-        """Without PX4's modes and setpoints where there is no whole log."""
+        """Track of one vehicle; without a complete log it has no modes and setpoints."""
         truth = read_truth(instance.logs(), self._world) if instance.clock else None
         if truth is not None:
             airborne = truth.position_m[:, 2] < -_AIRBORNE_ABOVE_M
@@ -255,7 +253,7 @@ class Px4Build:
                 return track
             setpoints = read_setpoints(instance.logs())
             status = np.maximum(np.searchsorted(truth.status_s, truth.time_s, "right") - 1, 0)
-            # The first is before any setpoint.
+            # Index 0 is before any setpoint.
             last = np.searchsorted(setpoints.time_s, truth.time_s, "right")
             return replace(
                 track,
@@ -297,7 +295,7 @@ class Px4Build:
         home = [f"{latitude:.7f}", f"{longitude:.7f}"]
         if self._degrees_1e7:
             home = [str(round(latitude * 1e7)), str(round(longitude * 1e7))]
-        # What a shell has set for other flights would change this one.
+        # PX4_* variables of the shell would change the flight.
         inherited = {k: v for k, v in os.environ.items() if not k.startswith("PX4_")}
         return {
             **inherited,
@@ -323,14 +321,12 @@ class Px4Build:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         for instance in self._instances[: len(processes)]:
-            # PX4 leaves them, and in the way of another user.
+            # PX4 leaves these files behind, which would block another user.
             for path in _own_files(instance.number):
                 with suppress(OSError):
                     path.unlink()
         self._stop.set()
         self._thread.join()
-
-    # The thread that hears where the vehicles are
 
     def _listen(self) -> None:
         while not self._stop.is_set():
@@ -342,7 +338,7 @@ class Px4Build:
         now_s = time.monotonic()
         for message_id, frame in frames(datagram):
             if message_id == mavlink.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS:
-                # 200 times a second, and of it only PX4's time is of use, which comes first.
+                # It comes 200 times a second; only its first field, PX4's time, is needed.
                 (time_us,) = struct.unpack("<Q", payload(frame, 8))
                 with self._heard_lock:
                     if not instance.clock or now_s - instance.clock[-1][0] > _CLOCK_PERIOD_S:
@@ -369,12 +365,12 @@ def frames(datagram: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def payload(frame: bytes, size: int) -> bytes:
-    """The first bytes of a message's payload, of which zeros at its end are not sent."""
+    """The first bytes of a message's payload, padded by the zeros that MAVLink truncates."""
     return frame[_HEADER_BYTES : _HEADER_BYTES + min(frame[1], size)].ljust(size, b"\0")
 
 
 def require_build(build: Path) -> Path:
-    """The whole path of a build of PX4's simulator. Raises ValueError if it is none."""
+    """The resolved path of a PX4 SITL build. Raises ValueError if it is not one."""
     build = build.expanduser().resolve()
     fault = _build_fault(build)
     if fault:
@@ -383,16 +379,16 @@ def require_build(build: Path) -> Path:
 
 
 def build_digest(build: Path) -> str:
-    """Of the program in a build: another one may fly otherwise. Raises OSError."""
+    """SHA-256 of a build's program, since another may fly differently. Raises OSError."""
     with (build / _PROGRAM).open("rb") as program:
         return hashlib.file_digest(program, "sha256").hexdigest()
 
 
 def _build_fault(build: Path) -> str:
-    """Why a folder is no build of PX4's simulator that this machine can fly; "" if it is one."""
+    """Why this machine cannot fly a folder as a PX4 SITL build; "" if it can."""
     program = build / _PROGRAM
     give = (
-        "give the folder that `make px4_sitl` of PX4 fills, such as "
+        "give the folder that PX4's `make px4_sitl` fills, such as "
         "PX4-Autopilot/build/px4_sitl_default"
     )
     if not build.exists():
@@ -410,7 +406,7 @@ def _build_fault(build: Path) -> str:
     if machine not in ("", platform.machine()):
         return f"bin/px4 is for {machine}, and this machine is {platform.machine()}: build it here"
     if not os.access(program, os.X_OK):
-        return "bin/px4 may not be run: chmod +x it, or build again"
+        return "bin/px4 is not executable: chmod +x it, or build again"
     if not (build / "etc" / "init.d-posix" / "rcS").is_file():
         return "has no etc/init.d-posix/rcS, so the build did not end: run `make px4_sitl` again"
     if not (build / "etc" / "init.d-posix" / "airframes" / f"{_AIRFRAME}_{_MODEL}").is_file():
@@ -422,7 +418,7 @@ def _build_fault(build: Path) -> str:
 
 
 def _machine(program: Path) -> str:
-    """The processor that an ELF program is for; "" for another kind of program."""
+    """The processor of an ELF program; "" for another kind of file."""
     with program.open("rb") as file:
         head = file.read(20)
     if head[:4] != b"\x7fELF" or len(head) < 20:
@@ -432,7 +428,7 @@ def _machine(program: Path) -> str:
 
 
 def _require_alone(instance: int) -> None:
-    """Raises VehicleError in words if a PX4 of that number runs, or has left what is in the way."""
+    """Raise VehicleError if a PX4 of that instance runs, or has left files in the way."""
     lock, _ = files = _own_files(instance)
     for path in files:
         if path.exists() and path.stat().st_uid != os.geteuid() and os.geteuid() != 0:
@@ -448,7 +444,7 @@ def _require_alone(instance: int) -> None:
 
 
 def _own_files(instance: int) -> tuple[Path, Path]:
-    """PX4's lock, and the socket of its commands."""
+    """PX4's lock file, and its command socket."""
     return Path(f"/tmp/px4_lock-{instance}"), Path(f"/tmp/px4-sock-{instance}")
 
 
@@ -466,7 +462,7 @@ def _udp(port: int) -> socket.socket:
 
 
 def _start_is_in_degrees_1e7(build: Path) -> bool:
-    """Older PX4s take the start, SIH_LOC_LAT0, as an integer, and PX4_HOME_LAT as it is."""
+    """Whether PX4_HOME_LAT is in 1e-7 degrees, as SIH_LOC_LAT0 of older PX4s, an integer."""
     try:
         parameters = json.loads((build / "parameters.json").read_text())["parameters"]
         types = {parameter["name"]: parameter["type"] for parameter in parameters}

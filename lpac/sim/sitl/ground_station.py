@@ -1,9 +1,9 @@
-"""Real PX4s for whoever does faults to them, or is their pilot: what is done, and what they do.
+"""Ground-station link to real PX4s, for faults, pilots and the vehicles' true positions.
 
-What is done to a PX4 comes from a ground station on its ground-station link, and so does what the
-receiver of its remote control hears (RC_CHANNELS_OVERRIDE; sticks by MANUAL_CONTROL are no remote
-control to PX4, which a pilot's robots are to obey alone). Where the vehicle really is tells PX4's
-own vehicle model. The names are those of `lpac.sim.px4.vehicle.Px4Vehicle`.
+Faults and the remote control go over this link. The remote control is RC_CHANNELS_OVERRIDE, since
+PX4 does not count MANUAL_CONTROL as a remote control, and a pilot's robots must obey that alone.
+True positions come from PX4's own vehicle model. Names are those of
+`lpac.sim.px4.vehicle.Px4Vehicle`.
 """
 
 import math
@@ -26,9 +26,9 @@ AIRBORNE_ABOVE_M = 0.15
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
 _MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
-# PX4 misses a remote control after half a second, and takes a pilot's mode only with one.
+# PX4 loses a remote control after half a second, and accepts a pilot's mode only with one.
 _STICKS_PERIOD_S, _MODE_AGAIN_S, _PARAMETERS_AGAIN_S = 0.05, 0.3, 0.5
-# Full sticks; PX4's own (v1.17) are slack in the middle, and 10 m/s. Their curve is fixed.
+# Full sticks; PX4's default (v1.17) has a dead zone, and 10 m/s. The curve is fixed.
 _STICKS_M_S = 4.0
 _STICKS = np.linspace(-1.0, 1.0, 201)
 _CURVE = 0.4 * _STICKS + 0.6 * _STICKS**3
@@ -36,15 +36,15 @@ _AS_THE_STICKS_SAY = {
     "MPC_VEL_MANUAL": _STICKS_M_S, "MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_VEL_MAX_DN": 1.5,
     "MAN_DEADZONE": 0.0,
 }  # fmt: skip
-# A receiver that was calibrated: which channel is which stick, from 1 on, and 1000 to 2000 us each.
+# Calibrated receiver: channels of the sticks, from 1 on, 1000 to 2000 us each.
 _CHANNELS = {
     "RC_CHAN_CNT": 4, "RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4,
 }  # fmt: skip
 # PX4's own default.
 _SATELLITES = 10
-# SIH_T_MAX of PX4's own quadrotor: what each motor lifts at full thrust, N.
+# SIH_T_MAX of PX4's own quadrotor: full thrust of each motor, N.
 _FULL_THRUST_N = 5.0
-# BAT1_SOURCE: what MAVLink tells, instead of PX4's own simulator. And cells as the simulator's.
+# BAT1_SOURCE: MAVLink instead of PX4's own simulator; cells as in the simulator.
 _EXTERNAL_BATTERY = 1
 _CELLS, _EMPTY_CELL_V, _FULL_CELL_V = 4, 3.6, 4.05
 _UNKNOWN_UINT16, _UNKNOWN_INT16 = 0xFFFF, 0x7FFF
@@ -59,9 +59,9 @@ _HEARD = {
 
 
 class RealVehicle:
-    """One PX4, over its ground-station link; its fields are changed while `stepped` is held.
+    """One PX4, over its ground-station link; hold `stepped` to change its fields.
 
-    `time_s` is `time.monotonic()` of the truth that was heard last; 0 before.
+    `time_s` is the `time.monotonic()` of the last true state; 0 before the first.
     """
 
     def __init__(self, instance: int, world: WorldOrigin) -> None:
@@ -76,7 +76,7 @@ class RealVehicle:
         self._ground_altitude_m = math.nan
         self._heartbeat_due_s = self._sticks_due_s = self._mode_due_s = 0.0
         self._heading_rad = 0.0
-        # What PX4 has not confirmed yet, by name: its bits as a real number, and its type.
+        # Parameters not confirmed yet, by name: the value's bits as a float, and its type.
         self._asked: dict[str, tuple[float, int]] = {}
         self._parameters_due_s = 0.0
         self._sticks_m_s: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -94,7 +94,7 @@ class RealVehicle:
 
     @property
     def rc_connected(self) -> bool:
-        """Whether somebody's remote control is on, and heard."""
+        """Whether a remote control is on and received."""
         return self._rc_connected
 
     @rc_connected.setter
@@ -105,12 +105,12 @@ class RealVehicle:
 
     @property
     def unconfirmed(self) -> tuple[str, ...]:
-        """The parameters that PX4 was told, and has not confirmed yet."""
+        """Parameters sent to PX4 and not confirmed yet."""
         return tuple(self._asked)
 
     @property
     def landed(self) -> bool:
-        """Whether it really stands on the ground."""
+        """Whether it truly stands on the ground."""
         return bool(self.position_m[2] > -AIRBORNE_ABOVE_M)
 
     @property
@@ -118,53 +118,51 @@ class RealVehicle:
         """PX4's estimated position, in the world's frame."""
         return self._local_m + self._origin_m
 
-    # What is done to it
-
     def set_mode(self, mode: Px4Mode) -> None:
-        """A ground station asks for a mode."""
+        """Command a mode, as a ground station."""
         custom = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, *CUSTOM_MODES[mode])
 
     def pilot(
         self, mode: Px4Mode = Px4Mode.POSCTL, stick_velocity_m_s: Sequence[float] = ()
     ) -> None:
-        """A pilot switches on the remote control, to `mode`, and holds the sticks."""
+        """Switch the remote control on, with this mode and these sticks."""
         self.rc_connected, self._pilots_mode = True, mode
         self.move_sticks(stick_velocity_m_s)
 
     def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
-        """North, east, down; empty means centred."""
+        """Hold the sticks for a velocity: north, east, down, m/s; empty means centred."""
         self._sticks_m_s = tuple(velocity_m_s) or (0.0, 0.0, 0.0)
 
     def lose_gps(self, *, lost: bool = True) -> None:
-        """Its receiver sees no satellite from now on, or sees them again."""
+        """Take all satellites from the receiver, or give them back."""
         satellites = 0 if lost else _SATELLITES
         self.set_parameter("SIM_GPS_USED", satellites)
 
     def weaken_motors(self, loss: float) -> None:
-        """Its motors lose this share of their full thrust."""
+        """Reduce the motors' full thrust by this share."""
         thrust_n = (1.0 - loss) * _FULL_THRUST_N
         self.set_parameter("SIH_T_MAX", thrust_n)
 
     def drain(self, remaining: float) -> None:
-        """The battery of an armed vehicle falls to this share within a second.
+        """Drain the battery of an armed vehicle to this share within a second.
 
-        PX4's simulator has a battery of 100 % whenever it is disarmed.
+        In PX4's simulator the battery is at 100 % while disarmed.
         """
         self.set_parameter("SIM_BAT_MIN_PCT", 100.0 * remaining)
         self.set_parameter("SIM_BAT_DRAIN", 1.0)
 
     def change_battery(self, remaining: float) -> None:
-        """A disarmed vehicle's battery has this share from now on.
+        """Set the battery of a disarmed vehicle to this share.
 
-        It is another one, which tells PX4 itself: not for flights, since PX4 takes one that does
-        not tell how long it lasts to last for no time, and returns.
+        It is an external battery over MAVLink, not for flights: it reports no remaining time, which
+        PX4 takes for none, and returns.
         """
         self.set_parameter("BAT1_SOURCE", _EXTERNAL_BATTERY)
         self._battery = remaining
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
-        """A ground station moves the estimator's origin."""
+        """Move the estimator's origin, as a ground station."""
         moved_m = self._origin_m + np.array([north_m, east_m, down_m])
         latitude, longitude, altitude_m = self._world.to_global(moved_m)
         self._send(
@@ -175,7 +173,7 @@ class RealVehicle:
         )  # fmt: skip
 
     def set_parameter(self, name: str, value: int | float) -> None:
-        """Of PX4, again until it confirms it; an integer is sent by its bits."""
+        """Set a parameter, repeated until PX4 confirms it; integers are encoded bytewise."""
         raw, kind = float(np.float32(value)), mavlink.MAV_PARAM_TYPE_REAL32
         if isinstance(value, int):
             raw = float(np.array([value], np.int32).view(np.float32)[0])
@@ -184,7 +182,7 @@ class RealVehicle:
         self._parameters_due_s = 0.0
 
     def clear_fence(self) -> None:
-        """As another ground station does it."""
+        """Clear the fence, as another ground station would."""
         fence = mavlink.MAV_MISSION_TYPE_FENCE
         self._send(mavlink.MAVLink_mission_clear_all_message(self._system, 1, fence))
 
@@ -204,13 +202,11 @@ class RealVehicle:
         self._send(mavlink.MAVLink_command_long_message(self._system, 1, command, 0, *filled))
 
     def _send(self, message: Any, mav: Any = None) -> None:
-        with suppress(ConnectionError):  # PX4 does not listen yet, or any more.
+        with suppress(ConnectionError):  # PX4 does not listen yet, or no longer.
             self._udp.send(message.pack(mav or self._mav))
 
-    # What it does
-
     def exchange(self) -> None:
-        """Say what is due, and take all that has come."""
+        """Send messages that are due, and handle all received ones."""
         now_s = time.monotonic()
         self._say(now_s)
         while datagram := self._receive():
@@ -232,7 +228,7 @@ class RealVehicle:
             )
             if self._battery is not None:
                 self._tell_of_battery(self._battery)
-            # It does not listen from the first moment on.
+            # Repeat until it answers: it does not listen from the start.
             if not self.time_s:
                 for message, rate_hz in _RATES_HZ.items():
                     self._command(
@@ -254,7 +250,7 @@ class RealVehicle:
             self.set_mode(self._pilots_mode)
 
     def close(self) -> None:
-        """Say and hear nothing more."""
+        """Close the socket."""
         self._udp.close()
 
     def _calibrate(self) -> None:
@@ -262,7 +258,7 @@ class RealVehicle:
             self.set_parameter(name, value)
 
     def _sticks(self) -> Any:
-        """Sticks of a person who looks along the vehicle's nose."""
+        """Sticks in the vehicle's body frame."""
         north, east, down = self._sticks_m_s
         cos, sin = math.cos(self._heading_rad), math.sin(self._heading_rad)
         shares = (
@@ -289,7 +285,7 @@ class RealVehicle:
         elif kind == "LOCAL_POSITION_NED":
             self._local_m = np.array([message.x, message.y, message.z])
         elif kind == "PARAM_VALUE":
-            # By its bits: most integers are no numbers as real ones.
+            # Compare bits: most integers are NaN as floats.
             told = np.float32(message.param_value).tobytes()
             asked = self._asked.get(message.param_id)
             if asked is not None and np.float32(asked[0]).tobytes() == told:
@@ -313,7 +309,7 @@ class RealVehicle:
 
 
 class RealVehicles:
-    """The PX4s of a build that runs; a context, in which a thread of this process hears them."""
+    """The PX4s of a running build; a context, in which a thread of this process serves them."""
 
     def __init__(self, px4s: Px4Build, world: WorldOrigin) -> None:
         self.stepped = threading.Condition()

@@ -1,4 +1,4 @@
-"""Flight of a real PX4's vehicle, from the log that PX4 writes (ULog)."""
+"""True flight of a real PX4's vehicle, from PX4's log (ULog)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,16 +36,16 @@ class Px4Truth:
 
 
 class Px4Setpoints(NamedTuple):
-    """When setpoints came from outside, (S,), PX4's time, s, ascending; whether of a velocity."""
+    """Times of external setpoints, (S,), PX4's time, s, ascending; whether each is a velocity."""
 
     time_s: F64
     is_velocity: Bools
 
 
 def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
-    """All that the logs of one PX4 tell, in the order of their times; None if they tell nothing.
+    """Truth in the logs of one PX4, in the order of time; None if they have none.
 
-    A log that ends in the middle, as of a PX4 that was killed, is read as far as it goes.
+    A truncated log, as of a killed PX4, is read as far as it goes.
     """
     logs = [read_topics(path, (_PLACE, _ESTIMATE, _STATUS)) for path in paths]
     places = [topics[_PLACE] for topics in logs if _PLACE in topics]
@@ -81,7 +81,7 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
 
 
 def read_setpoints(paths: Sequence[Path]) -> Px4Setpoints:
-    """All setpoints that the logs of one PX4 tell; PX4 notes at most ten a second."""
+    """All setpoints in the logs of one PX4, which logs at most ten a second."""
     logs = [topics[_SETPOINT] for path in paths if (topics := read_topics(path, (_SETPOINT,)))]
     time_s = _joined([log["timestamp"] for log in logs]) * 1e-6
     is_velocity = _joined([(log["velocity"] > 0) & (log["position"] == 0) for log in logs]) > 0.0
@@ -94,7 +94,7 @@ def _joined(parts: Sequence[npt.NDArray[Any]]) -> F64:
 
 
 def _velocity_errors_m_s(estimates: Sequence[Topic], time_s: F64, velocity_m_s: F64) -> F64:
-    """At these times; 0 where nothing is known."""
+    """Errors of the estimated velocity at these times; 0 without an estimate."""
     at_s = _joined([estimate["timestamp"] for estimate in estimates]) * 1e-6
     if len(at_s) == 0:
         return np.zeros(len(time_s))

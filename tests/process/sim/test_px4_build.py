@@ -130,7 +130,7 @@ def as_a_file(build: Path) -> None:
                        (b / "build" / "sitl").mkdir(), (b / "x").rename(b / "build/sitl/bin")),
             "is PX4's source, not its build: give ",
         ),
-        (lambda b: (b / "bin" / "px4").chmod(0o644), "bin/px4 may not be run"),
+        (lambda b: (b / "bin" / "px4").chmod(0o644), "bin/px4 is not executable"),
         (lambda b: (b / "bin" / "px4").write_bytes(elf(OTHER_MACHINE)), "and this machine is"),
         (lambda b: shutil.rmtree(b / "etc"), "has no etc/init.d-posix/rcS"),
         (
