@@ -12,7 +12,7 @@ import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
-# What a VOXL2 runs; and what stands in for it where Ubuntu's archive cannot be reached.
+# A VOXL2 runs the first; the second replaces it where Ubuntu's archive is out of reach.
 SUITE, SECOND_SUITE = "bionic", "bookworm"
 MIRRORS = {
     SUITE: "http://archive.ubuntu.com/ubuntu",
@@ -38,7 +38,7 @@ _KEYRING_URL = (
 _KEYRING_SHA256 = "5d8609563fb3074026b254d7d5248f90d393c7dbafcac48916f333bf3c90fed9"
 _ANSWER_WITHIN_S = 10.0
 
-# Nothing here has the internet or a screen.
+# Hosts have neither internet nor screen.
 _MASKED = (
     "apt-daily.timer", "apt-daily-upgrade.timer", "console-getty.service", "fstrim.timer",
     "getty@.service", "motd-news.timer", "systemd-resolved.service", "systemd-timesyncd.service",
@@ -74,11 +74,11 @@ _FILES = {
 
 
 class NoHostsError(ValueError):
-    """This machine cannot run robot hosts; the text says what it takes."""
+    """This machine cannot run robot hosts; the text says what is missing."""
 
 
 def require_tools() -> None:
-    """Raises NoHostsError unless this machine can run robot hosts."""
+    """Raise NoHostsError unless this machine can run robot hosts."""
     packages = [package for program, package in NEEDED.items() if not shutil.which(program)]
     if packages:
         raise NoHostsError(f"robot hosts need: sudo apt install {' '.join(packages)}")
@@ -89,9 +89,9 @@ def require_tools() -> None:
 
 
 def base_tree(say: Callable[[str], None]) -> Path:
-    """The tree of `SUITE`, made if it is not in the cache yet; or else that of `SECOND_SUITE`.
+    """The tree of `SUITE`, built if not cached; if that fails, the tree of `SECOND_SUITE`.
 
-    Raises NoHostsError if neither is there nor can be made.
+    Raises NoHostsError if neither can be built.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lpac-edge/hosts"
     cache.mkdir(parents=True, exist_ok=True)
@@ -123,7 +123,7 @@ def _make(suite: str, tree: Path) -> None:
         making = Path(name)
         keys = [f"--keyring={_ubuntu_keys(making)}"] if suite == SUITE else []
         root = making / "root"
-        # Updates too, as a VOXL2 has them: the first openssl of bionic knows no Ed25519.
+        # With updates, as on a VOXL2: the first openssl of bionic does not support Ed25519.
         suites = (suite, f"{suite}-updates")
         _run(
             "mmdebstrap", "--quiet", "--variant=minbase", f"--include={','.join(PACKAGES)}", *keys,
@@ -140,7 +140,7 @@ def _make(suite: str, tree: Path) -> None:
             (units / f"multi-user.target.wants/{service}.service").symlink_to(
                 f"/etc/systemd/system/{service}.service"
             )
-        # Each host has its own.
+        # Each host gets its own keys.
         for key in (root / "etc/ssh").glob("ssh_host_*"):
             key.unlink()
         root.rename(tree)
@@ -153,7 +153,7 @@ def _ubuntu_keys(folder: Path) -> Path:
     except urllib.error.URLError as error:
         raise OSError(f"{MIRRORS[SUITE]} does not answer: {error.reason}") from None
     if hashlib.sha256(package).hexdigest() != _KEYRING_SHA256:
-        raise OSError(f"{_KEYRING_URL} is not the file that it was")
+        raise OSError(f"{_KEYRING_URL}: wrong SHA-256: the file has changed")
     (folder / "keys.deb").write_bytes(package)
     _run("dpkg-deb", "--extract", str(folder / "keys.deb"), str(folder / "keys"))
     return folder / "keys/usr/share/keyrings/ubuntu-archive-keyring.gpg"
@@ -164,5 +164,5 @@ def _run(*command: str) -> None:
         command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
     )
     if done.returncode:
-        last = (done.stderr.strip() or "it said nothing").splitlines()[-1]
+        last = (done.stderr.strip() or "it printed nothing").splitlines()[-1]
         raise OSError(f"{command[0]} failed: {last}")

@@ -52,8 +52,8 @@ mount -t overlay -o "lowerdir=/run/base,upperdir=upper,workdir=work" "$1" root
 class SimulatedHost:
     """One robot's computer and vehicle; `SimulatedHosts` makes it.
 
-    `vehicle` is its PX4: whoever commands it or sets more than one of its fields holds `stepped`.
-    It is another object each time that the host is switched on.
+    `vehicle` is its PX4, a new object each time the host is switched on. Hold `stepped` to command
+    it or to set more than one of its fields.
     """
 
     def __init__(self, rack: Rack, folder: Path, robot_id: int, key: str) -> None:
@@ -68,7 +68,7 @@ class SimulatedHost:
         self._console = folder / f"{self.name}.console"
         private = folder / f"{self.name}.host_key"
         self.host_key = new_key(private)
-        # Path -> mode and text: what tells this host from the others.
+        # Path -> mode and text of the files that differ between hosts.
         self._files = {
             "etc/machine-id": (0o444, uuid.uuid4().hex + "\n"),
             "etc/ssh/ssh_host_ed25519_key": (0o600, private.read_text()),
@@ -84,12 +84,12 @@ class SimulatedHost:
 
     @property
     def root(self) -> Path:
-        """Its disk as seen from here, also while it is off."""
+        """Its disk as seen from this machine, also while it is off."""
         return self._rack.path(f"run/{self.name}/root")
 
     @property
     def stepped(self) -> threading.Condition:
-        """Raises RuntimeError while the host is off."""
+        """Condition of the vehicle's steps. Raises RuntimeError while the host is off."""
         if self._server is None:
             raise RuntimeError(f"{self.name} is off")
         return self._server.stepped
@@ -105,7 +105,7 @@ class SimulatedHost:
             file.write_text(text)
 
     def switch_on(self) -> None:
-        """Begin to boot, with the vehicle running."""
+        """Start the vehicle, and begin to boot."""
         self._rack.sh(
             _WIRE, self.name, f"{self.address}/{self._rack.network.prefixlen}",
             f"02:00:00:00:{self._rack.number:02x}:{self.robot_id:02x}",
@@ -133,7 +133,7 @@ class SimulatedHost:
         )  # fmt: skip
 
     def await_boot(self) -> None:
-        """Returns once the system is up. Raises OSError if it does not come up."""
+        """Wait until the system is up. Raises OSError if it does not boot."""
         assert self._booting and self._process
         until_s = time.monotonic() + BOOT_WITHIN_S
         with self._booting:
@@ -151,7 +151,7 @@ class SimulatedHost:
             self._server = None
 
     def ended(self) -> None:
-        """Wait until the system, which was killed, is gone."""
+        """Wait for the end of the killed system."""
         if self._process is not None:
             self._process.wait()
             self._process = None
@@ -172,7 +172,7 @@ class SimulatedHost:
 
 
 def new_key(private: Path) -> str:
-    """Make an SSH key pair; what comes back is the public one, as in authorized_keys."""
+    """Make an SSH key pair; returns the public key, as in authorized_keys."""
     public = private.with_name(f"{private.name}.pub")
     private.unlink(missing_ok=True)
     public.unlink(missing_ok=True)

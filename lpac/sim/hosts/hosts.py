@@ -1,8 +1,8 @@
 """Robot computers on this machine: each boots its own systemd and sshd, and has a simulated PX4.
 
-A host is what a VOXL2 is to software: Ubuntu 18.04, a disk of its own, an address in a network that
-it shares with the others and with this machine, MAVLink at 127.0.0.1:14551. What it is not: its
-clock is this machine's (it cannot be set), its kernel too, and memory limits are not enforced.
+To software a host is like a VOXL2: Ubuntu 18.04, its own disk, an address in a network shared with
+the other hosts and this machine, MAVLink at 127.0.0.1:14551. Differences: it uses this machine's
+kernel and clock, which cannot be set, and memory limits are not enforced.
 """
 
 import os
@@ -32,7 +32,7 @@ class SimulatedHosts:
     """A context in which hosts r1, r2, ... run, the last `spares` of them without a slot.
 
     `folder` then holds `fleet_toml`, a complete description of them for `lpac fleet`, with
-    ssh_config, keys and world.env beside it. `fleet` is a name that no other hosts have now.
+    ssh_config, keys and world.env next to it. `fleet` is a name that no other running hosts use.
     """
 
     host_type = SimulatedHost
@@ -47,10 +47,10 @@ class SimulatedHosts:
         spares: int = 0,
         say: Say = lambda _: None,
     ) -> None:
-        """Starts nothing. `image` and `bundle` are what the fleet is to fly; they are not read.
+        """Start nothing yet. `image` and `bundle` are written to fleet.toml, but not read.
 
         Raises NoHostsError (a ValueError) if this machine cannot run robot hosts, ValueError for
-        a number that cannot be.
+        an invalid number.
         """
         if not 1 <= count <= MAX_HOSTS:
             raise ValueError(f"hosts = {count}: must be from 1 to {MAX_HOSTS}")
@@ -69,9 +69,9 @@ class SimulatedHosts:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        """Boot all. Raises NoHostsError as above, OSError if a host does not come up."""
+        """Boot all. Raises NoHostsError as above, OSError if a host does not boot."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        # Those of hosts that are gone.
+        # Keys of earlier hosts.
         shutil.rmtree(self.folder / "keys", ignore_errors=True)
         base = base_tree(self._say)
         with ExitStack() as stack:

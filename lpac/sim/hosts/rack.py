@@ -1,7 +1,7 @@
-"""Namespaces of this machine that robot hosts live in: processes, mounts and networks of their own.
+"""Namespaces for robot hosts: separate processes, mounts and networks.
 
-All of it hangs on one process. When that one ends, or whoever started it, in whatever way, the
-kernel ends the hosts and removes their disks and networks; only empty control groups are left.
+One process owns them all. When it or its parent ends, in whatever way, the kernel ends the hosts
+and removes their disks and networks; only empty control groups remain.
 """
 
 import contextlib
@@ -41,18 +41,18 @@ ip link set "$2" up
 class Rack:
     """A context in which hosts can be mounted, wired and run.
 
-    `number` is this rack's alone on this machine while it is there, and so is `network`, in which
-    `laptop_address` is this machine.
+    `number` and `network` are unique among the running racks of this machine; `laptop_address` is
+    this machine's address in the network.
     """
 
     def __init__(self, base: Path) -> None:
-        """`base`: the tree that is to be /run/base in the rack's mounts."""
+        """`base` is the tree mounted as /run/base in the rack."""
         self._base = base
         self._stack = ExitStack()
         self._pid = 0
 
     def __enter__(self) -> Self:
-        """Raises NoHostsError if this machine lets no namespaces or networks be made."""
+        """Raise NoHostsError if this machine does not allow new namespaces or networks."""
         with ExitStack() as stack:
             self.number, self.network = self._claim(stack)
             self.laptop_address = str(self.network[1])
@@ -63,9 +63,9 @@ class Rack:
                 subprocess.Popen(
                     ["unshare", "--pid", "--mount", "--fork", "--kill-child", "--mount-proc",
                      "sh", "-c", "echo made; exec cat"],
-                    # Whatever becomes of this program, cat's input ends.
+                    # However this program ends, cat's input is closed.
                     stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                    # Ctrl-C is for whoever uses this.
+                    # Ctrl-C goes to the caller alone.
                     process_group=0, text=True,
                 )
             )  # fmt: skip
@@ -87,7 +87,7 @@ class Rack:
         self._stack.close()
 
     def path(self, path: str) -> Path:
-        """How other processes see a path of the rack's mounts."""
+        """Path of a file in the rack's mounts, as seen from outside."""
         return Path(f"/proc/{self._pid}/root/{path.lstrip('/')}")
 
     def sh(self, script: str, *arguments: str) -> None:
@@ -121,7 +121,7 @@ class Rack:
 
     @contextlib.contextmanager
     def in_network(self, name: str) -> Iterator[None]:
-        """The calling thread makes its sockets in this network namespace of the rack."""
+        """Enter a network namespace of the rack with the calling thread, to make sockets in it."""
         with (
             Path(f"/proc/{os.getpid()}/task/{threading.get_native_id()}/ns/net").open() as own,
             self.path(f"run/netns/{name}").open() as other,
@@ -136,7 +136,7 @@ class Rack:
         return ["nsenter", f"--target={self._pid}", "--mount", "--pid", *command]
 
     def _claim(self, stack: ExitStack) -> tuple[int, ipaddress.IPv4Network]:
-        """A number that no other rack has now, and a network that this machine does not use."""
+        """Claim a number that no other rack uses, and a network free on this machine."""
         used = _used_networks()
         for number in range(1, MAX_RACKS + 1):
             claim = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
@@ -148,7 +148,7 @@ class Rack:
                 network = ipaddress.IPv4Network(text)
                 if not any(network.overlaps(other) for other in used):
                     return number, network
-        raise NoHostsError("robot hosts find no private network that is free on this machine")
+        raise NoHostsError("no private network for robot hosts is free on this machine")
 
     def _cgroups(self) -> list[Path]:
         """Paths of systemd's control groups: one hierarchy, or two on older systems."""
@@ -163,7 +163,7 @@ class Rack:
 
 
 def children(pid: int) -> list[int]:
-    """The processes that this one started and that have not ended."""
+    """Running child processes."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
