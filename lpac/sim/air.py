@@ -1,4 +1,4 @@
-"""Links in memory: what robots and a ground say to each other, on a simulated clock."""
+"""In-memory links between robots and ground stations, on a simulated clock."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,22 +13,22 @@ from edge.messages.topics import ReceiveCallback, Topic
 from lpac.sim.schedule import Schedule
 
 Subscriptions = Mapping[Topic, ReceiveCallback]
-# The first ground; further ones are -2, -3, ...
+# Station id of the first ground station; further ones are -2, -3, ...
 GROUND = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Air(Bounded):
-    """Faults of the radio. Any of them may be replaced while it is used.
+    """Radio faults. They may be replaced while the radio is in use.
 
     From one sender to one receiver a message is lost with probability `loss`, arrives twice with
     `duplication`, with one bit flipped with `corruption`, and travels `delay_s` on average,
     anything from half to one and a half of it, so that later ones overtake it. Robots further apart
-    than `range_m` do not hear each other; a ground hears everybody. Who is in different groups of
-    `partition` (robot ids, and grounds') hears nothing of each other; who is in none hears
-    everybody. Nobody hears the `silent`, and the `deaf` hear nobody.
+    than `range_m` do not receive each other; a ground station is always in range. Stations in
+    different groups of `partition` (ids of robots and ground stations) cannot communicate; stations
+    in no group reach all. `silent` stations are never received, and `deaf` ones receive nothing.
 
-    Raises ValueError that names an impossible value.
+    Raises ValueError that names the invalid field.
     """
 
     loss: Share = 0.0
@@ -45,7 +45,7 @@ class Air(Bounded):
             raise ValueError(f"range_m = {self.range_m}: must be above 0")
 
     def keeps_apart(self, sender: int, receiver: int) -> bool:
-        """Whether nothing of the one reaches the other, whatever their distance."""
+        """Whether these faults block all messages to the receiver, at any distance."""
         if sender in self.silent or receiver in self.deaf:
             return True
         if not self.partition:
@@ -56,7 +56,10 @@ class Air(Bounded):
 
 
 class Radio:
-    """All links of a fleet. `air` may be replaced at any time; it counts what was sent and lost."""
+    """All links of a fleet, with counts of sent bytes and lost messages.
+
+    `air` may be replaced at any time.
+    """
 
     def __init__(
         self,
@@ -75,13 +78,13 @@ class Radio:
         self._links: list[RadioLink] = []
 
     def link(self, station: int, subscriptions: Subscriptions) -> "RadioLink":
-        """A program's link, as robot `station`, or as a ground, which is below 0."""
+        """Open a link for robot `station`; ids below 0 are ground stations."""
         link = RadioLink(self, station, subscriptions)
         self._links.append(link)
         return link
 
     def suspend(self, station: int, duration_s: float) -> None:
-        """Delay until then all that comes to that station's programs."""
+        """Hold back all messages to that station for this long."""
         for link in self._links:
             if link.station == station:
                 link.suspended_until_s = self.schedule.monotonic_s() + duration_s
@@ -95,7 +98,7 @@ class Radio:
         return frozenset(other.station for other in self._links if other is not link)
 
     def send(self, sender: "RadioLink", topic: Topic, data: bytes) -> None:
-        """To everybody else who listens to the topic."""
+        """Send to all other subscribers of the topic."""
         own = sender.station
         key = f"ground/{topic.name}" if topic.sender == "ground" else f"robot/{own}/{topic.name}"
         self.sent_bytes += len(data)
@@ -103,7 +106,7 @@ class Radio:
         for receiver in self._links:
             if receiver is sender or not receiver.listens(topic) or len(data) > topic.limit_bytes:
                 continue
-            # All are drawn for each receiver: one chance alone does not change those after it.
+            # All four are drawn for each receiver: changing one fault leaves later draws alone.
             lost, twice, travel, second_travel = self.rng.random(4).tolist()
             if self._apart(own, receiver.station):
                 continue
@@ -137,27 +140,27 @@ class RadioLink:
         self._subscriptions: Subscriptions = dict(subscriptions)
 
     def publish(self, topic: Topic, data: bytes) -> None:
-        """Send to whoever listens; it may be lost."""
+        """Publish to all subscribers; messages may be lost."""
         self._radio.send(self, topic, data)
 
     def peers(self) -> int:
-        """How many other stations there are, in range or not."""
+        """Number of other stations, in range or not."""
         return len(self._radio.others(self))
 
     def refused(self) -> int:
-        """None: what is too large is dropped on its way, and nobody floods it."""
+        """Return 0: oversized messages are dropped on the way, and nothing floods the link."""
         return 0
 
     def is_claimed(self, robot_id: int) -> bool:
-        """Whether another program says that it is that robot."""
+        """Whether another station uses that robot id."""
         return robot_id in self._radio.others(self)
 
     def listens(self, topic: Topic) -> bool:
-        """Whether it wants to hear that."""
+        """Whether the link subscribes to the topic."""
         return topic in self._subscriptions
 
     def hear(self, topic: Topic, key: str, data: bytes) -> None:
-        """Something has come, unless the program ended while it was on its way."""
+        """Pass a message to its callback, unless the link closed while it was on its way."""
         if self._radio.schedule.monotonic_s() < self.suspended_until_s:
             self._radio.schedule.at(self.suspended_until_s, partial(self.hear, topic, key, data))
             return
@@ -166,13 +169,13 @@ class RadioLink:
             callback(key, data)
 
     def close(self) -> None:
-        """The program has ended."""
+        """Unsubscribe and leave the radio."""
         self._subscriptions = {}
         self._radio.leave(self)
 
 
 def _corrupted(data: bytes, bit: int) -> bytes:
-    """The same, but for one bit."""
+    """Copy of the message with one bit flipped."""
     changed = bytearray(data)
     changed[bit // 8] ^= 1 << bit % 8
     return bytes(changed)

@@ -1,9 +1,8 @@
 """The baseline controllers: Lloyd's algorithm with several degrees of knowledge.
 
 As in CoverageControl, all robots step at once and know the true positions (decentralised ones:
-those within communication range), whatever happens to messages; where robots are wrong about where
-they are, these are. None of them is a bound: Lloyd's
-algorithm ends in local minima, the clairvoyant's too.
+those within communication range), whatever happens to messages. Position errors apply to them too.
+None of them is a bound: Lloyd's algorithm ends in local minima, even with full knowledge.
 """
 
 import math
@@ -39,10 +38,10 @@ BaselineName = Literal[
     "centralized-cvt",
     "clairvoyant-cvt",
 ]
-# What a cell is taken for that has not been seen, by the baselines with a prior. Without one they
-# know no reason to go where nobody was.
+# Importance that baselines with a prior assume for unseen cells. Without it nothing draws them to
+# unexplored ground.
 PRIOR = 0.1
-# Frontiers are looked for on a lattice of this pitch, in cells; the sensor sees 64.
+# Pitch of the lattice on which frontiers are sought, in cells; the sensor sees 64.
 _FRONTIER_PITCH = 8
 
 
@@ -119,20 +118,20 @@ class DecentralizedCvt:
 
 
 class SharedMaps:
-    """Joint map of robots that tell each other everything, at once, also through others.
+    """Maps of robots that share everything they see at once, over any number of hops.
 
-    They see and talk at each `sense`; who has seen something, has it for ever.
+    They observe and exchange maps at each `sense`, and forget nothing.
     """
 
     def __init__(self, importance: F32, perception: PerceptionParameters, robots: int) -> None:
         self._importance = importance
         self._perception = perception
-        # Of robots that have heard the same it is the same array, which is never written to again.
+        # Robots with equal knowledge share one array, which is never written to again.
         self._seen: list[Bools] = [np.zeros(importance.shape, np.bool_)] * robots
         self._others: list[npt.NDArray[np.intp]] = []
 
     def sense(self, positions: F64) -> None:
-        """All look around at `positions` (N, 2), and tell whom they can reach."""
+        """Observe at `positions` (N, 2), model units, and merge the maps of connected robots."""
         size, world_size = self._perception.sensor_size, self._perception.world_size
         self._others = [np.zeros(0, np.intp)] * len(positions)
         for group in connected(positions, self._perception.communication_range):
@@ -145,13 +144,13 @@ class SharedMaps:
                 self._others[robot] = group[group != robot]
 
     def others(self, robot: int) -> npt.NDArray[np.intp]:
-        """Robots that this one can reach now, also through others."""
+        """Robots that this one can reach now, over any number of hops."""
         return self._others[robot]
 
     def around(self, robot: int, position: F64) -> tuple[F32, Bools, tuple[int, int]]:
         """The part of the robot's local map that is in the world.
 
-        What is there, as far as it knows; what it knows; and the part's first cell.
+        Returns the importance as the robot knows it, the mask of seen cells, and the first cell.
         """
         size = self._perception.local_map_size
         corner = window_corner(position, size)
@@ -184,10 +183,10 @@ class SharedCvt:
 
 
 class FrontierCvt(SharedCvt):
-    """First explores, then covers: robots share maps and positions as `SharedCvt`'s do.
+    """Explore, then cover; robots share maps and positions as in `SharedCvt`.
 
-    Each goes to what is unseen and nearest in its own Voronoi cell of its local map, and when there
-    is nothing, to the cell's centroid. Frontiers: Yamauchi, "Frontier-based exploration using
+    Each robot goes to the nearest unseen point of its Voronoi cell in its local map, or to the
+    cell's centroid if all of it was seen. Frontiers: Yamauchi, "Frontier-based exploration using
     multiple robots" (Agents 1998); one Voronoi cell a robot, so that no two go to one: Hu et al.,
     "Voronoi-based multi-robot autonomous exploration in unknown environments via deep reinforcement
     learning" (IEEE Trans. Vehicular Technology, 2020).
@@ -217,7 +216,7 @@ def connected(positions: F64, communication_range: float) -> list[npt.NDArray[np
 
 def _unseen_points(seen: Bools, origin: tuple[int, int]) -> F64:
     """(n, 2): centres of unseen cells, of those on the lattice, in model units."""
-    # In the middle, since at the world's border half a pitch stays unseen.
+    # Offset by half a pitch, since that much stays unseen at the world's border.
     first = [(_FRONTIER_PITCH // 2 - start) % _FRONTIER_PITCH for start in origin]
     lattice = seen[first[0] :: _FRONTIER_PITCH, first[1] :: _FRONTIER_PITCH]
     cells = np.argwhere(~lattice) * _FRONTIER_PITCH + first + origin
@@ -247,9 +246,9 @@ def make_baseline(
 
 
 class BaselineSwarm:
-    """A baseline's robots: all decide at every sample, and fly there until the next."""
+    """Robots of a baseline: all choose goals at every sample, and fly there until the next."""
 
-    # They say nothing.
+    # Baselines send no messages.
     largest_payload = 0.0
 
     def __init__(
@@ -261,7 +260,7 @@ class BaselineSwarm:
         bias_m: F64 | None,
         world_size: int,
     ) -> None:
-        """With `bias_m` (N, 2) robots are wrong by that about where they are, and see that place.
+        """`bias_m` (N, 2) is the robots' position error; they observe the wrong place accordingly.
 
         `world_size` is in model units.
         """
@@ -292,11 +291,11 @@ class BaselineSwarm:
         return self._vehicles.positions_m()
 
     def velocities_m_s(self) -> F64:
-        """The velocities (N, 2) that the vehicles are told now."""
+        """The velocities (N, 2) commanded now."""
         return self._vehicles.velocities_m_s()
 
     def heard(self, _: float) -> Bools:
-        """(N, N): nobody; a baseline's knowledge does not come by messages."""
+        """(N, N): all False; baselines use no messages."""
         return np.zeros((len(self.alive),) * 2, np.bool_)
 
     @property
@@ -305,5 +304,5 @@ class BaselineSwarm:
         return np.ones(len(self._vehicles.positions_m()), np.bool_)
 
     def message_counts(self) -> dict[str, int]:
-        """Empty: a baseline's knowledge does not come by messages."""
+        """Empty: baselines use no messages."""
         return {}

@@ -14,11 +14,11 @@ _ANSWERS_WITHIN_S = 5.0
 def over_ray(address: str) -> Pool:
     """A pool of all cores of the cluster at `address`: HOST:PORT, or what `ray.init` takes.
 
-    Raises ConnectionError if nobody listens there, ValueError if the host is none.
+    Raises ConnectionError if nothing listens there, ValueError for an invalid host.
     """
     found = host_and_port("--ray", address)
     if found is not None:
-        # Ray would try for minutes.
+        # Ray itself would retry for minutes.
         try:
             socket.create_connection(found, _ANSWERS_WITHIN_S).close()
         except OSError as error:
@@ -29,7 +29,7 @@ def over_ray(address: str) -> Pool:
     ) -> Generator[Outcome, None, None]:
         ray.init(address=address, log_to_driver=False, ignore_reinit_error=True)
         try:
-            # A lost node costs the tasks that it was at: others do them again.
+            # The tasks of a lost node are run again elsewhere.
             remote = ray.remote(num_cpus=1, max_retries=3)(do)
             given = [remote.remote(task) for task in tasks]
             while given:

@@ -18,10 +18,10 @@ Outcome = TypeVar("Outcome")
 
 
 class Pool(Protocol):
-    """Does the tasks in processes; outcomes come as they are done, in any order.
+    """Run tasks in processes; outcomes come as they are done, in any order.
 
-    What to do is a function that other processes can import; tasks and outcomes can be pickled.
-    Who does not take all outcomes closes the generator: the processes end then.
+    `do` must be importable, tasks and outcomes must pickle. Close the generator to end the
+    processes early.
     """
 
     def __call__(
@@ -32,7 +32,7 @@ class Pool(Protocol):
 def in_this_process(
     do: Callable[[Task], Outcome], tasks: Sequence[Task]
 ) -> Generator[Outcome, None, None]:
-    """A `Pool` of no process but this: one task after another, in their order."""
+    """A `Pool` without processes of its own: run the tasks here, in their order."""
     for task in tasks:
         yield do(task)
 
@@ -40,19 +40,19 @@ def in_this_process(
 def over_cores(
     do: Callable[[Task], Outcome], tasks: Sequence[Task]
 ) -> Generator[Outcome, None, None]:
-    """A `Pool` of a process for each core."""
+    """A `Pool` of one process for each core."""
     return over_processes(do, tasks, len(os.sched_getaffinity(0)))
 
 
 def over_processes(
     do: Callable[[Task], Outcome], tasks: Sequence[Task], at_most: int
 ) -> Generator[Outcome, None, None]:
-    """So many processes at most; outcomes as they come.
+    """A pool of at most `at_most` processes.
 
     Raises ChildProcessError if one of them is killed.
     """
-    # Workers read the tasks from a file: who waits for a worker that was killed to take a large one
-    # from a pipe waits forever.
+    # Workers read the tasks from a file: writing a large task to the pipe of a killed worker
+    # would block forever.
     with NamedTemporaryFile(prefix="lpac-tasks-") as file:
         pickle.dump((do, tasks), file)
         file.flush()
@@ -71,7 +71,7 @@ def _from_workers(workers: int, tasks: int, path: str) -> Generator[Any, None, N
     except BrokenProcessPool:
         raise ChildProcessError("a worker process was killed") from None
     except BaseException:
-        # What nobody waits for ends now.
+        # End the tasks that nobody waits for any more.
         with _without_interrupts():
             for worker in active_children():
                 worker.terminate()
@@ -83,13 +83,13 @@ def _from_workers(workers: int, tasks: int, path: str) -> Generator[Any, None, N
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Ctrl-C comes at the end, and to no process that begins here.
+    """Delay Ctrl-C to the end, and keep it from processes that start here.
 
     A worker that is interrupted, or loses its parent, while it begins prints a traceback. A pool
     whose shutdown is interrupted leaves workers that print one, and names of semaphores with
     multiprocessing's resource tracker, which warns of them after the program's last line.
     """
-    # It unblocks the signal when it begins.
+    # It unblocks the signal when it starts, so start it first.
     resource_tracker.ensure_running()
     in_main = threading.current_thread() is threading.main_thread()
     came: list[int] = []
@@ -112,7 +112,7 @@ _given: tuple[Callable[[Any], Any], Sequence[Any]]
 
 
 def _begin(path: str) -> None:
-    """A worker knows what to do before it is told which."""
+    """Load function and tasks in a new worker."""
     global _given  # noqa: PLW0603
     _obey_parent()
     with Path(path).open("rb") as file:
@@ -125,7 +125,7 @@ def _do_nth(n: int) -> Any:
 
 
 def _obey_parent() -> None:
-    """A worker ends when its parent says so, and with it; Ctrl-C is the parent's."""
+    """End with the parent process, and leave Ctrl-C to it."""
     # Not "ignored", which the programs that a worker starts would inherit.
     signal.signal(signal.SIGINT, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

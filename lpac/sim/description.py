@@ -1,4 +1,4 @@
-"""A simulated fleet's fleet.toml, as far as it is the same for all robots: field and flight."""
+"""The part of a simulated fleet's fleet.toml that all robots share: field and flight."""
 
 import math
 from dataclasses import asdict
@@ -20,7 +20,7 @@ _FENCE_BUFFER_M = 1.5
 
 
 def fence_around(field_m: float, robots: int, errors: ErrorBudget = ERRORS) -> Fence:
-    """Around a field that is a square of that side, and above the heights of so many robots."""
+    """Fence around a square field, m, with room for the flight heights of `robots` robots."""
     low_m, high_m = -_FENCE_BEYOND_FIELD_M, field_m + _FENCE_BEYOND_FIELD_M
     return Fence(
         vertices_m=((low_m, low_m), (high_m, low_m), (high_m, high_m), (low_m, high_m)),
@@ -31,7 +31,7 @@ def fence_around(field_m: float, robots: int, errors: ErrorBudget = ERRORS) -> F
 
 
 def robot_table(fence: Fence, max_speed_m_s: float, errors: ErrorBudget = ERRORS) -> dict[str, Any]:
-    """[robot] of fleet.toml: what all robots' robot.toml have alike."""
+    """[robot] of fleet.toml: the settings that all robots share."""
     return {
         "on_stop": "land",
         "policy": {
@@ -48,7 +48,7 @@ def robot_table(fence: Fence, max_speed_m_s: float, errors: ErrorBudget = ERRORS
             "floor_m": fence.floor_m,
             "ceiling_m": fence.ceiling_m,
         },
-        # Fields may be larger than that, and fleets fly higher.
+        # Fields may be larger, and fleets fly higher, than the defaults.
         "reach": {
             "distance_m": max(REACH.distance_m, math.ceil(math.dist(*fence.vertices_m[::2]))),
             "ceiling_m": max(REACH.ceiling_m, fence.ceiling_m),

@@ -1,4 +1,4 @@
-"""The engines: each flies scenarios, and what comes of a flight is its record."""
+"""The engines: each flies scenarios and returns a record of each flight."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -26,14 +26,12 @@ from lpac.sim.points import fly_points, require_points
 from lpac.sim.scenario import Scenario
 
 EngineName = Literal["point", "simulated", "mavlink", "px4"]
-# What the drill does to a fleet, by engine.
+# Injections of the drill that each engine supports.
 INJECTIONS: dict[EngineName, tuple[object, ...]] = {
     "point": (), "simulated": SUPPORTED, "mavlink": MAVLINK, "px4": PX4,
 }  # fmt: skip
-# Flights of these go one after another, with nothing beside them.
+# Flights of these run one at a time, on an otherwise idle machine.
 IN_REAL_TIME: tuple[EngineName, ...] = ("mavlink", "px4")
-
-
 # Called with a `FlightMoment` of points, or a `FleetMoment`: both have `time_s`, `step`, `stop`.
 Watch = Callable[[Any], object]
 
@@ -41,13 +39,13 @@ Watch = Callable[[Any], object]
 class Engine(Protocol):
     """One way to fly scenarios.
 
-    With `whole_robots` the programs' own loops fly, with takeoff and landing.
+    With `whole_robots` the robot programs' own loops fly, including takeoff and landing.
     """
 
     whole_robots: bool
 
     def require_able(self, scenario: Scenario) -> None:
-        """Raise ValueError that names what this engine cannot do."""
+        """Raise ValueError that names the field this engine does not support."""
 
     def fly(
         self,
@@ -56,20 +54,21 @@ class Engine(Protocol):
         folder: Path | None = None,
         watch: Watch | None = None,
     ) -> list[FlightRecord]:
-        """The record of each, in their order; whole robots' logs stay in `folder`, if there is one.
+        """Fly the scenarios in order, and return their records.
 
-        `watch` is called several times a second, and may stop the flight; a fault's flight is not
-        watched. A fleet's `script` says in its record what kept it from its end.
+        Whole robots' logs stay in `folder`, if given. `watch` is called several times a second, and
+        may stop the flight; a fault's flight is not watched. If a fleet's script did not reach its
+        end, `script` in its record says why.
 
-        Raises BundleError; ValueError for what it cannot do, and for points that were stopped at
-        their start; OSError, and in real time FleetError, LinkError, GroundError or VehicleError.
+        Raises BundleError; ValueError for an unsupported scenario, and for points that were stopped
+        at the start; OSError, and in real time FleetError, LinkError, GroundError or VehicleError.
         """
 
 
 class Points:
-    """Points that fly what the robots' loops decide, or a baseline.
+    """Point robots under the policy or a baseline.
 
-    Several flights of a policy that nobody watches go together, in batches, and come out the same.
+    Unwatched flights of a policy run in batches, with the same results.
     """
 
     whole_robots = False
@@ -130,7 +129,7 @@ class _WholeRobots(ABC):
 class ClockedRobots(_WholeRobots):
     """Whole robots on simulated vehicles and one simulated clock, all in this process.
 
-    `recorded` is the folder of an earlier flight, whose policies' steps are taken again.
+    `recorded` is the folder of an earlier flight whose policy outputs are replayed.
     """
 
     say: Say = lambda _: None
@@ -158,8 +157,8 @@ class ClockedRobots(_WholeRobots):
 class Programs(_WholeRobots):
     """A program for each robot, in real time, on simulated vehicles or on PX4s of a build.
 
-    `carries` is asked, once the fleet is described, how many of them this machine carries; None if
-    nobody looks.
+    `carries` measures how many robots this machine can run, once the fleet is laid out; it returns
+    None if not measured.
     """
 
     px4_build: Path | None = None
@@ -187,20 +186,20 @@ class Programs(_WholeRobots):
 
 
 def engine_of(name: EngineName, px4_build: Path | None = None, say: Say = lambda _: None) -> Engine:
-    """The engine of that name; PX4s alone need their build, `say` is told how a fleet goes on.
+    """The engine of that name; `say` gets the progress of a fleet.
 
-    Raises ValueError.
+    Raises ValueError for an unknown name, and for px4 without its build.
     """
     require(EngineName, name, "engine")
     if name == "px4" and px4_build is None:
-        raise ValueError("px4: needs PX4's build folder")
+        raise ValueError("engine = 'px4': needs PX4's build folder: give px4_build")
     if name == "point":
         return Points()
     return ClockedRobots(say) if name == "simulated" else Programs(px4_build, say)
 
 
 def flies(engine: EngineName, fault: Fault) -> bool:
-    """Whether all that a fault does can be done to the vehicles of an engine."""
+    """Whether the engine supports all injections of a fault."""
     return supports(INJECTIONS[engine], fault)
 
 
@@ -209,10 +208,10 @@ def _require_fault(engine: EngineName, scenario: Scenario) -> None:
     if name and scenario.robots < 2:
         raise ValueError(f"robots = {scenario.robots}: must be at least 2 for a fault")
     if name and name not in FAULTS:
-        raise ValueError(f"fault = {name}: there is none; `lpac drill --list` has all")
+        raise ValueError(f"fault = {name}: no such fault: choose one of `lpac drill --list`")
     if name and not flies(engine, FAULTS[name]):
         raise ValueError(
-            f"fault = {name}: is not flown with {engine}; `lpac drill --list` tells what is"
+            f"fault = {name}: is not flown with {engine}: choose one of `lpac drill --list`"
         )
 
 
@@ -228,30 +227,30 @@ def fly(
 ) -> FlightRecord:
     """Fly one scenario on the engine of that name; `bundle` flies, or sizes a baseline's maps.
 
-    `folder` keeps what whole robots log. Raises what `engine_of` and `Engine.fly` do, and
-    ValueError for a watcher of a fault's flight, which has none.
+    `folder` keeps the logs of whole robots. Raises what `engine_of` and `Engine.fly` do, and
+    ValueError for `watch` with a fault.
     """
     if scenario.fault and watch is not None:
-        raise ValueError(f"fault = {scenario.fault}: such a flight is not watched")
+        raise ValueError(f"fault = {scenario.fault}: cannot be watched: leave out watch")
     chosen = engine_of(engine, px4_build, say)
     chosen.require_able(scenario)
     loaded = load_bundle(bundle) if engine == "point" and isinstance(bundle, Path) else bundle
-    # In batches a policy that fails ends them; without, it is seen what its robots do.
+    # A failing policy ends a batch; with a watcher, points show how the robots react to it.
     [record] = chosen.fly([scenario], loaded, folder, watch or (lambda _: None))
     return record
 
 
 def require_flown(record: FlightRecord) -> None:
-    """Raise ValueError for a flight that came to nothing."""
+    """Raise ValueError for a flight without a mission."""
     problem = record.script.problem
     if problem is not None or not len(record.curve_time_s):
         raise ValueError(f"the flight came to nothing: {problem or 'nobody flew'}")
 
 
-# Kept, so that flights share their begin.
+# Cached, so that flights share their start.
 @lru_cache(maxsize=1)
 def drill_of(bundle: str, bundle_id: str) -> SimulatedDrill:
-    """The drill with the bundle at a path, which may be another one by now."""
+    """The drill with the bundle at a path; the id tells a changed bundle from the cached one."""
     return SimulatedDrill(Path(bundle))
 
 

@@ -14,13 +14,13 @@ from edge.core.schema import Bounded, NonNegative
 
 @dataclass(frozen=True, slots=True)
 class Failure(Bounded):
-    """A robot is out of the swarm from `from_s` on until `until_s`; s since the start.
+    """Absence of a robot from the swarm, from `from_s` until `until_s`; s since the start.
 
-    A point stands still, hears and says nothing, and does not count for the cost; it comes back as
-    a restarted program does: with no explored map and no messages. A whole robot is given to a
-    pilot, who flies it out of the fence and back.
+    A point stands still, neither receives nor sends, and does not count for the cost; it comes back
+    like a restarted program, without map or messages. A whole robot is flown out of the fence and
+    back by a pilot.
 
-    Raises ValueError that names what is impossible.
+    Raises ValueError that names the invalid field.
     """
 
     robot: int
@@ -36,7 +36,7 @@ class Failure(Bounded):
 
     @classmethod
     def parse(cls, text: str) -> "Failure":
-        """Of "3@60-80", robot 3 from 60 to 80 s. Raises ValueError."""
+        """Parse "3@60-80": robot 3, from 60 to 80 s. Raises ValueError."""
         found = _AWAY.fullmatch(text)
         if found is None:
             raise ValueError(f"robot away {text!r}: must be ROBOT@FROM-UNTIL in s, such as 3@60-80")
@@ -49,21 +49,21 @@ _LOST = re.compile(rf"(\d+)@{_SECONDS}")
 
 
 class LostRobots(NamedTuple):
-    """So many of the robots are gone from that time of the flight on, s; at 0, they never were."""
+    """Number of robots lost at a flight time, s; at 0 they are missing from the start."""
 
     robots: int
     at_s: float
 
     @classmethod
     def parse(cls, text: str) -> "LostRobots":
-        """Of "2@20". Raises ValueError."""
+        """Parse "2@20". Raises ValueError."""
         found = _LOST.fullmatch(text)
         if found is None:
             raise ValueError(f"lost = {text!r}: must be ROBOTS@SECONDS, such as 2@20")
         return cls(int(found[1]), float(found[2]))
 
     def failures(self, of_robots: int) -> tuple[Failure, ...]:
-        """Those of the last so many of a team; none if they never were. Raises ValueError."""
+        """Failures of the team's last robots; none if `at_s` is 0. Raises ValueError."""
         if self.at_s == 0.0:
             return ()
         if self.robots >= of_robots:
@@ -79,7 +79,7 @@ NONE_LOST = LostRobots(0, 0.0)
 
 
 def alive_at(robots: int, failures: Iterable[Failure], time_s: float) -> Bools:
-    """(robots,): who has not failed at that time."""
+    """(robots,): whether each robot is alive at that time."""
     alive = np.ones(robots, np.bool_)
     for failure in failures:
         if failure.from_s <= time_s < failure.until_s:
@@ -88,7 +88,7 @@ def alive_at(robots: int, failures: Iterable[Failure], time_s: float) -> Bools:
 
 
 def require_possible(failures: Sequence[Failure], robots: int) -> None:
-    """Raise ValueError if a robot of no swarm of so many fails, or one twice, or all at once."""
+    """Raise ValueError for an unknown robot, overlapping failures of one, or no robot left."""
     for i, failure in enumerate(failures):
         if not 0 <= failure.robot < robots:
             raise ValueError(f"failures: robot {failure.robot}: must be from 0 to {robots - 1}")
@@ -99,4 +99,4 @@ def require_possible(failures: Sequence[Failure], robots: int) -> None:
                     "failed already"
                 )
         if not alive_at(robots, failures, failure.from_s).any():
-            raise ValueError(f"failures: at {failure.from_s} s nobody is left")
+            raise ValueError(f"failures: no robot is left at {failure.from_s} s")

@@ -34,7 +34,7 @@ def write_flight(scenario: Scenario, record: FlightRecord, folder: Path) -> None
 
 
 def write_demo(flights: Mapping[str, tuple[Scenario, FlightRecord]], folder: Path) -> None:
-    """Write demo.json and the figure demo.png / demo.pdf: the first flight beside the others."""
+    """Write demo.json and the figure demo.png / demo.pdf: the first flight next to the others."""
     _write_json({name: summary(*flight) for name, flight in flights.items()}, folder / "demo.json")
     save(snapshots_and_costs({name: of for name, (_, of) in flights.items()}), folder / "demo")
 

@@ -1,4 +1,4 @@
-"""A flight's record told: as JSON, and in lines for people."""
+"""Summaries of a flight's record: JSON, and text lines."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -94,7 +94,7 @@ def _of_script(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
 
 
 def _start_positions_m(record: FlightRecord) -> list[tuple[float, ...] | None]:
-    """(x, y) where each robot took itself to be when the mission began; None if nowhere."""
+    """Estimated (x, y) of each robot when the mission began; None if unknown."""
     places_m = record.places_at(0.0)
     return [
         tuple(round(metres, 3) for metres in places_m[name]) if name in places_m else None
@@ -103,7 +103,7 @@ def _start_positions_m(record: FlightRecord) -> list[tuple[float, ...] | None]:
 
 
 def _mission_share(record: FlightRecord, robot_id: int) -> float:
-    """0 for a robot that is not the mission's."""
+    """Share of the mission that the robot flew; 0 if it took no part."""
     return sum(record.mission_share(r) for r in record.robots if r.robot_id == robot_id)
 
 
@@ -154,7 +154,7 @@ def _program_summary(record: FlightRecord, robot: int) -> dict[str, Any]:
 
 
 def summary_lines(scenario: Scenario, record: FlightRecord) -> list[str]:
-    """A flight by the script for people, a line each."""
+    """Text lines on a scripted flight."""
     script = record.script
     restarts = sum(program.restarts for program in script.programs)
     not_done = sum(not command.done for command in script.commands)
@@ -162,7 +162,7 @@ def summary_lines(scenario: Scenario, record: FlightRecord) -> list[str]:
     if script.problem is not None:
         lines.append(f"PROBLEM: {script.problem}")
     if script.overloaded or not record.took_off:
-        # All else that there is to tell follows from that.
+        # All other figures follow from that.
         return lines
     if not record.flew_mission:
         lines.append("no mission was flown")
@@ -194,7 +194,7 @@ def summary_lines(scenario: Scenario, record: FlightRecord) -> list[str]:
     )
     lines += _loop_lines(record)
     if script.vehicle == "simulated":
-        # On a simulated clock nobody is late, and all of it is one process.
+        # On a simulated clock no loop is late, and one process runs all.
         return lines
     cpu_shares = [100.0 * program.cpu_share for program in script.programs]
     memory_mb = [program.peak_memory_mb for program in script.programs]
@@ -213,7 +213,7 @@ def summary_lines(scenario: Scenario, record: FlightRecord) -> list[str]:
 
 
 def _fence_line(margin_m: float, true_margin_m: float, position_error_m: float) -> str:
-    """Robots keep the fence as they estimate their places, which may truly err by so much."""
+    """Robots keep the fence by their estimates, so the true margin may be short by their error."""
     estimated, true = (
         "not known"
         if not np.isfinite(m)

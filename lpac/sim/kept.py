@@ -1,4 +1,4 @@
-"""Outcomes that are kept on disk while they come, so that what is killed goes on where it was."""
+"""Outcomes kept on disk as they come, so that an interrupted run can resume."""
 
 import hashlib
 import json
@@ -10,14 +10,14 @@ from typing import Any
 
 
 class KeptOutcomes:
-    """Lines of JSON in a file, below one that says what they came of.
+    """Lines of JSON in a file, after a header line that identifies their source.
 
-    What came of anything else, such as of another version of the code, does not count, and is not
-    kept. `lines` are those that count.
+    Lines under another header, such as another version of the code, are discarded. `lines` are the
+    valid ones.
     """
 
     def __init__(self, path: Path, came_of: Mapping[str, Any]) -> None:
-        """Makes the file, or reads it. Raises OSError."""
+        """Create or read the file. Raises OSError."""
         self._path = path
         self.lines: list[dict[str, Any]] = []
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -27,13 +27,13 @@ class KeptOutcomes:
             self.lines = [line for line in lines if line is not None]
         if first == came_of and None not in lines:
             return
-        # Of another version, or killed in the middle of a line, in which the next would go on.
+        # Another version, or a partial last line that the next one would continue.
         new = path.with_name(f"{path.name}.new")
         new.write_text("".join(json.dumps(line) + "\n" for line in (came_of, *self.lines)))
         new.replace(path)
 
     def add(self, line: dict[str, Any]) -> None:
-        """Keep one more. Raises OSError."""
+        """Append a line. Raises OSError."""
         with self._path.open("a") as file:
             file.write(json.dumps(line) + "\n")
         self.lines.append(line)
@@ -41,7 +41,7 @@ class KeptOutcomes:
 
 @cache
 def code_digest(*packages: ModuleType) -> str:
-    """Of the sources of these packages."""
+    """SHA-256 of the sources of these packages."""
     digest = hashlib.sha256()
     for package in packages:
         root = Path(package.__path__[0])

@@ -1,4 +1,4 @@
-"""One flight of points: what it begins with, and how it goes on."""
+"""Simulation of one flight of point robots."""
 
 import math
 from collections.abc import Callable
@@ -34,8 +34,8 @@ class Preparation:
     """Initial state of a simulator: a scenario together with a bundle.
 
     `bundle` has the scenario's own sizes in its manifest. `starts_m` (N, 2) and `bias_m` (N, 2) or
-    None are in the mission frame, `importance` is (world_size, world_size), `times_s` are those of
-    the samples, and what is random in flight is drawn from `clock_rng` and within `medium`.
+    None are in the mission frame, m, `importance` is (world_size, world_size), `times_s` are the
+    sample times. Random draws in flight come from `clock_rng` and from `medium`.
     """
 
     scenario: Scenario
@@ -69,7 +69,7 @@ class Preparation:
         )
 
     def until(self, time_s: float) -> "Preparation":
-        """The same of a flight that ends with that sample. Raises ValueError at its start."""
+        """This preparation, cut to end with that sample. Raises ValueError at time 0."""
         if time_s <= 0.0:
             raise ValueError("the flight was stopped at its start: nothing was flown")
         return replace(
@@ -83,7 +83,7 @@ class Preparation:
     ) -> FlightRecord:
         """Record of the flight with true positions (T, N, 2) at `times_s`.
 
-        Points are in the air from the first to the last, unless they failed, and say nothing.
+        Points are in the air at every sample, unless they failed.
         """
         scenario, time_s = self.scenario, np.array(self.times_s)
         heights_m = np.zeros(len(time_s))
@@ -115,9 +115,9 @@ class Preparation:
 
 
 def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
-    """Draw what is random in `scenario` before the start.
+    """Draw all initial random values of `scenario`.
 
-    Raises BundleError for a bundle without perception, ValueError for impossible sizes and link
+    Raises BundleError for a bundle without perception, ValueError for invalid sizes and link
     parameters.
     """
     require_points(scenario)
@@ -161,7 +161,7 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
 
 
 def require_points(scenario: Scenario) -> None:
-    """Raise ValueError for what points cannot do."""
+    """Raise ValueError that names a field points do not support."""
     scenario.require_default(
         "points", "errors", "wind_m_s", "budget", "sensor", "secure", "transport", "fault"
     )
@@ -180,8 +180,8 @@ class FlyingSwarm(Protocol):
 class WorldMoment:
     """One world at one time of a flight; valid until the flight goes on.
 
-    `positions_m` (N, 2) are the true ones in the mission frame. What is not asked for is not
-    computed, and nothing that the robots do later depends on what is.
+    `positions_m` (N, 2) are the true ones in the mission frame. Properties are computed on access,
+    and reading them does not affect the flight.
     """
 
     def __init__(self, prepared: Preparation, swarm: FlyingSwarm, time_s: float) -> None:
@@ -197,9 +197,9 @@ class WorldMoment:
 
     @property
     def velocities_m_s(self) -> F64:
-        """(N, 2): the velocities that the vehicles are told, mission frame, m/s.
+        """(N, 2): commanded velocities, mission frame, m/s.
 
-        With a scenario's `lag_s` they follow these; the world's border holds them all the same.
+        Vehicles follow them with the scenario's `lag_s`, and stop at the world's border.
         """
         return self._flying.velocities_m_s()
 
@@ -210,12 +210,12 @@ class WorldMoment:
 
     @property
     def alive(self) -> Bools:
-        """(N,): who has not failed."""
+        """(N,): whether each robot is alive."""
         return self._flying.alive
 
     @property
     def adjacency(self) -> Bools:
-        """(N, N): who is truly in communication range of whom, and both alive; not oneself."""
+        """(N, N): whether two robots, both alive, are truly in range; False on the diagonal."""
         x, y = self.positions.T
         distances = np.hypot(x[:, None] - x, y[:, None] - y)
         np.fill_diagonal(distances, np.inf)
@@ -224,17 +224,17 @@ class WorldMoment:
 
     @property
     def heard(self) -> Bools:
-        """(N, N), [receiver, sender]: of whom a robot has a message that is fresh.
+        """(N, N), [receiver, sender]: whether a robot holds a fresh message of another.
 
-        Of baselines nobody: they know of each other without messages.
+        All False for baselines, which use no messages.
         """
         return self._flying.heard(self.time_s)
 
     @property
     def cost(self) -> float:
-        """The coverage cost J, in model units, of those who are alive; NaN if nobody is.
+        """The coverage cost J of the robots alive, model units; NaN if there are none.
 
-        At a flight's `cost_time_s` the same as its `cost`.
+        At a flight's `cost_time_s` it equals the record's `cost`.
         """
         scenario, alive = self.prepared.scenario, self.alive
         if not alive.any():
@@ -250,7 +250,7 @@ class FlightMoment(WorldMoment):
     stopped = False
 
     def stop(self) -> None:
-        """End the flight here: its duration is what it has lasted by now."""
+        """End the flight now; its duration becomes the time flown."""
         self.stopped = True
 
 
@@ -261,12 +261,12 @@ def fly_points(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -
     """Simulate `scenario`; `bundle` flies it, or gives a baseline the sizes of its perception.
 
     `watch` is called at each sample, every `SAMPLE_S` from 0 to the end, and may stop the flight.
-    What it returns is ignored; what it raises comes through. The flight is the same, bit by bit, as
-    without it. Raises BundleError for a bundle without perception, ValueError for impossible link
+    Its return value is ignored; its exceptions propagate. The flight is bit for bit the same as
+    without it. Raises BundleError for a bundle without perception, ValueError for invalid link
     parameters, and for a flight that is stopped at its start.
     """
     if not isinstance(bundle, Bundle):
-        raise ValueError(f"{bundle}: is no bundle in memory: load_bundle gives one of a path")
+        raise ValueError(f"{bundle}: is no loaded bundle: load it with load_bundle")
     prepared = prepare(scenario, bundle)
     swarm: Swarm[ClockedPac] | BaselineSwarm
     if scenario.controller == "lpac":
@@ -296,7 +296,7 @@ def fly_points(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -
 
 
 def _boot_of(prepared: Preparation) -> Callable[[int, int, OdometrySource], ClockedPac]:
-    """Starts of robots with the code of real ones; see `Swarm`."""
+    """A `boot` for `Swarm` that makes robots of the real robot code."""
     policy = load_policy(prepared.bundle)
     sensor = WorldSensor(prepared.importance, prepared.perception.sensor_size)
 
@@ -314,19 +314,19 @@ def _boot_of(prepared: Preparation) -> Callable[[int, int, OdometrySource], Cloc
 
 
 def cost_times_s(duration_s: float) -> F64:
-    """(C,): when the cost of a flight is taken; each second, and at its end."""
+    """(C,): times at which a flight's cost is computed: each second, and at its end."""
     time_s = _sample_times_s(duration_s)
     return np.array([*time_s[:-1:SAMPLES_PER_COST], time_s[-1]])
 
 
 def _sample_times_s(duration_s: float) -> list[float]:
-    """From 0 to the duration, every SAMPLE_S and at its end."""
+    """Every SAMPLE_S from 0, and the end."""
     samples = math.ceil(duration_s / SAMPLE_S - 1e-9)
     return [*(sample * SAMPLE_S for sample in range(samples)), duration_s]
 
 
 def _bias_m(scenario: Scenario) -> F64 | None:
-    """(robots, 2): how wrong each is about where it is; None if nobody is."""
+    """(robots, 2): position errors, m; None without any."""
     bias_m: F64 | None = None
     if scenario.position_bias is not None:
         bias = np.array(scenario.position_bias, np.float64)

@@ -1,8 +1,7 @@
-"""Ports of this machine for programs that will bind them later, some seconds from now.
+"""Free ports for programs that bind them some seconds later.
 
-A port that the system finds free can be anybody's a moment later: it gives them to every socket
-that asks for none in particular. So these are of a range that it does not give away by itself, in
-blocks, and each process keeps one block for as long as it lives.
+The system may assign any of its ephemeral ports to another socket in the meantime. So these come
+from below that range, in blocks, and each process keeps one block while it lives.
 """
 
 import itertools
@@ -14,9 +13,9 @@ _BLOCKS = range(20_000, 32_000, 200)
 
 
 def free_ports(count: int) -> tuple[int, ...]:
-    """Ports that nobody has now, and that no other process gets from here.
+    """Ports that are free now, and that this function gives to no other process.
 
-    Raises OSError if there are not so many.
+    Raises OSError if too few are free.
     """
     found: list[int] = []
     for _ in range(_BLOCKS.step):
@@ -25,13 +24,13 @@ def free_ports(count: int) -> tuple[int, ...]:
         port = next(_own_ports)
         if _is_free(port):
             found.append(port)
-    raise OSError(f"no {count} free ports from {_BLOCKS.start} to {_BLOCKS.stop}")
+    raise OSError(f"fewer than {count} ports from {_BLOCKS.start} to {_BLOCKS.stop} are free")
 
 
 def _ports_of_a_block() -> Iterator[int]:
-    """Those of a block that no other process has, again and again."""
+    """Cycle through the ports of a block that no other process holds."""
     for first in random.sample(_BLOCKS, len(_BLOCKS)):
-        # The first port of a block is held, and says so to the other processes.
+        # Binding the first port of a block claims it among the processes.
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
             try:
                 held.bind(("127.0.0.1", first))

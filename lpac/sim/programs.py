@@ -1,4 +1,4 @@
-"""Programs of this project that the simulator starts beside itself."""
+"""Programs of this project that the simulator starts as processes."""
 
 import signal
 import subprocess
@@ -9,14 +9,14 @@ from pathlib import Path
 def python_program(module: str, *arguments: str) -> list[str]:
     """The command line that runs a module as a program, in this Python.
 
-    Whatever lies in the working directory, a folder `edge` of the user's own too, it is this
-    project that runs: -P keeps that directory out of the modules' path.
+    -P keeps the working directory out of the module path: a user's own folder `edge` must not
+    replace this project's.
     """
     return [sys.executable, "-P", "-m", module, *arguments]
 
 
 class LpacProgram:
-    """A command of `lpac`, in a process of its own; what it prints goes to the end of `log`."""
+    """A command of `lpac` as a process; its output is appended to `log`."""
 
     def __init__(self, log: Path, *arguments: str) -> None:
         self.log = log
@@ -24,23 +24,23 @@ class LpacProgram:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start it, also again after it has ended."""
+        """Start the program, or restart it after it has ended."""
         with self.log.open("ab") as output:
             self._process = subprocess.Popen(
                 python_program("lpac.cli.main", *self._arguments),
                 stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                # Ctrl-C is for the launcher alone, which lands the vehicles first.
+                # Ctrl-C goes to the launcher alone, which lands the vehicles first.
                 process_group=0,
             )  # fmt: skip
 
     @property
     def running(self) -> bool:
-        """Whether it was started, and has not ended."""
+        """Whether it has started and not ended."""
         return self._process is not None and self._process.poll() is None
 
     @property
     def pid(self) -> int:
-        """Raises RuntimeError if the program was never started."""
+        """Process id. Raises RuntimeError if the program was never started."""
         if self._process is None:
             raise RuntimeError(f"{' '.join(self._arguments)} was not started")
         return self._process.pid
@@ -51,7 +51,7 @@ class LpacProgram:
             self._process.send_signal(number)
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """The exit code once the program has ended, None if it has not within the time."""
+        """The exit code once the program has ended; None on timeout."""
         assert self._process is not None
         try:
             return self._process.wait(timeout_s)
@@ -59,22 +59,22 @@ class LpacProgram:
             return None
 
     def terminate(self) -> None:
-        """Tell it to end, also if it stands still."""
+        """Send SIGTERM, and SIGCONT in case the program is stopped."""
         self.send_signal(signal.SIGTERM)
         self.send_signal(signal.SIGCONT)
 
     def kill(self) -> None:
-        """End it at once."""
+        """Kill the program, and wait for its end."""
         self.send_signal(signal.SIGKILL)
         self.wait()
 
     def last_words(self) -> str:
-        """The last line that it printed."""
+        """The last non-blank line of its output."""
         lines = self.log.read_text(errors="replace").split("\n") if self.log.exists() else []
         return next((line for line in reversed(lines) if line.strip()), "it printed nothing")
 
     def ending(self) -> str:
-        """How the program has ended, in words; with the last line that it printed, if by itself."""
+        """Signal that ended the program, or its exit code and last line of output."""
         code = self.wait(0.0)
         if code is not None and code < 0:
             return f"by {signal.Signals(-code).name}"

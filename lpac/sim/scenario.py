@@ -23,7 +23,7 @@ from lpac.sim.ticks import Clocks
 if TYPE_CHECKING:
     Features = tuple[Feature, ...]
 else:
-    # Files name a world's file instead: msgspec takes no union of dataclasses.
+    # Configuration files name a world file instead: msgspec takes no union of dataclasses.
     Features = tuple
 
 # The sensor's type that every installation has.
@@ -35,7 +35,7 @@ _INPUT_AGE_S = 1.0
 
 
 class UnableError(ValueError):
-    """An engine cannot do what a field of a scenario asks for."""
+    """An engine does not support the value of a scenario's field."""
 
     def __init__(self, engine: str, name: str, value: object, default: object) -> None:
         super().__init__(engine, name, value, default)
@@ -45,33 +45,33 @@ class UnableError(ValueError):
         engine, name, value, default = self.args
         must = f"{name} = {value}: must be"
         allowed = "left out" if default is None else default or repr(default)
-        return f"{must} {allowed} for {engine}, which know nothing of it"
+        return f"{must} {allowed} for {engine}, which do not support it"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario(Bounded):
-    """One flight: who flies what, over which world, and what is wrong with it.
+    """One flight: team, controller, world and faults.
 
-    Everything random follows from `seed`, but for the timing of programs in real time. All engines
-    fly it (`lpac.sim.engines`); an engine refuses what it cannot do.
+    All random values follow from `seed`, except the timing of programs in real time. All engines
+    (`lpac.sim.engines`) fly it; an engine refuses fields that it does not support.
 
     World, in model units: without `features` there are `random_feature_count` Gaussian ones,
     `random_feature_sigma` (least, greatest) wide.
 
-    Team: `starts_m` is one position in the mission frame per robot; else points start anywhere in
-    the world, and whole robots where there is room. `failures` are robots that are away: points
-    fail, whole robots are taken out of the fence by a pilot. `clocks` are the periods of the
-    robots' loops. Where `max_input_age_s` is None, inputs count for two of the longest periods, and
-    for 1 s at least.
+    Team: `starts_m` is one position in the mission frame per robot; by default points start
+    anywhere in the world, and whole robots where there is room. `failures` are absent robots:
+    points fail, whole robots are flown out of the fence by a pilot. `clocks` are the periods of the
+    robots' loops. If `max_input_age_s` is None, inputs are valid for two of the longest periods,
+    and for at least 1 s.
 
-    Points alone: `max_speed_m_s` is the bundle's where it is None; `position_bias` is, per robot
-    and in model units, how wrong its position is, to which the error of `position_error_m` is
-    added; with a `radio` its model says what is lost and late.
+    Points alone: `max_speed_m_s` defaults to the bundle's; `position_bias` is the position error of
+    each robot, model units, to which the error of `position_error_m` is added; a `radio` model
+    gives loss and delay of messages.
 
-    Whole robots alone: `budget` is the error that they allow for. With a `fault` of the drill that
-    says how long the flight lasts.
+    Whole robots alone: `budget` is the error that they allow for. A `fault` of the drill sets the
+    duration of the flight.
 
-    Raises ValueError that names what is impossible.
+    Raises ValueError that names the invalid field.
     """
 
     controller: Annotated[
@@ -152,27 +152,27 @@ class Scenario(Bounded):
                 f"random_feature_sigma = {self.random_feature_sigma}: must be (least, greatest)"
             )
         if self.controller != "lpac" and self.failures:
-            raise ValueError(f"controller = {self.controller!r}: a baseline knows no failures")
+            raise ValueError(f"controller = {self.controller!r}: must be lpac with failures")
         if self.controller != "lpac" and self.radio is not None:
-            raise ValueError(f"controller = {self.controller!r}: a baseline needs no radio")
+            raise ValueError(f"controller = {self.controller!r}: must be lpac with a radio")
         require_possible(self.failures, self.robots)
 
     @property
     def input_age_s(self) -> float:
-        """For how long images and actions count."""
+        """How long images and actions are valid, s."""
         if self.max_input_age_s is not None:
             return self.max_input_age_s
         return max(_INPUT_AGE_S, 2.0 * self.clocks.perception_s, 2.0 * self.clocks.policy_s)
 
     @property
     def link(self) -> LinkQuality:
-        """Loss and delay of messages, as they were asked for, or by the model."""
+        """Loss and delay of messages: as set, or by the radio model."""
         if self.radio is None:
             return LinkQuality(self.loss, self.delay_s)
         return self.radio.link(self.robots, self.payload, 1.0 / self.clocks.policy_s)
 
     def perception_of(self, bundle: Bundle) -> PerceptionParameters:
-        """The bundle's, with the scenario's sizes. Raises BundleError if it has none."""
+        """The bundle's perception with the scenario's sizes. Raises BundleError without one."""
         trained = bundle.manifest.perception
         if trained is None:
             name = bundle.manifest.name
@@ -194,7 +194,7 @@ class Scenario(Bounded):
         )
 
     def require_default(self, engine: str, *names: str) -> None:
-        """Raise UnableError if one of these fields asks for what this engine cannot do."""
+        """Raise UnableError if one of these fields, which `engine` does not support, is set."""
         for name in names:
             value, default = getattr(self, name), getattr(_DEFAULT, name)
             if value != default:

@@ -1,14 +1,14 @@
-"""One simulated clock, and what is due on it."""
+"""Simulated clock with scheduled callbacks."""
 
 import heapq
 from collections.abc import Callable
 
 
 class Schedule:
-    """Runs what is due, in the order of time; of equal times, in the order of asking.
+    """Run callbacks in the order of time; those of equal times in the order of scheduling.
 
-    It is a `Clock` itself: what runs sees its own time. The wall clock began at `epoch_s`, which
-    may be set.
+    It is also a `Clock`, on which each callback sees its own time. The wall clock starts at
+    `epoch_s`, which may be set.
     """
 
     def __init__(self, epoch_s: float = 0.0) -> None:
@@ -18,28 +18,28 @@ class Schedule:
         self._asked = 0
 
     def monotonic_s(self) -> float:
-        """Since the beginning."""
+        """Time since the start, s."""
         return self._now_s
 
     def unix_s(self) -> float:
-        """The wall clock."""
+        """Unix time, s."""
         return self.epoch_s + self._now_s
 
     def at(self, time_s: float, do: Callable[[], object]) -> None:
-        """Do it then, or now if that is past."""
+        """Schedule a callback; a time in the past means now."""
         self._asked += 1
         heapq.heappush(self._due, (max(time_s, self._now_s), self._asked, do))
 
     def every(
         self, period_s: float, do: Callable[[], object], after_s: float = 0.0
     ) -> "Recurrence":
-        """Do it after that time, and then every period, on absolute deadlines."""
+        """Schedule a callback after `after_s` and then every period, on absolute deadlines."""
         recurrence = Recurrence(self, period_s, do, self._now_s + after_s)
         self.at(recurrence.due_s, recurrence)
         return recurrence
 
     def run_until(self, time_s: float) -> None:
-        """Let that much time pass."""
+        """Run all callbacks due until `time_s`, and advance the clock to it."""
         due = self._due
         while due and due[0][0] <= time_s:
             self._now_s, _, do = heapq.heappop(due)
@@ -55,16 +55,16 @@ class WallClock:
         self._schedule = schedule
 
     def monotonic_s(self) -> float:
-        """Since the beginning."""
+        """Time since the schedule's start, s."""
         return self._schedule.monotonic_s()
 
     def unix_s(self) -> float:
-        """Time on this computer's clock."""
+        """Unix time of this computer."""
         return self._schedule.unix_s() + self.ahead_s
 
 
 class Recurrence:
-    """Task that a schedule repeats, next at `due_s`."""
+    """Periodic callback of a schedule, next at `due_s`."""
 
     def __init__(
         self, schedule: Schedule, period_s: float, do: Callable[[], object], due_s: float
@@ -76,7 +76,7 @@ class Recurrence:
         self._hangs_until_s = due_s
 
     def __call__(self) -> None:
-        """It is due."""
+        """Run the callback and schedule the next."""
         if self._do is None:
             return
         self.due_s += self._period_s
@@ -85,9 +85,9 @@ class Recurrence:
             self._do()
 
     def hang(self, duration_s: float) -> None:
-        """Leave out what is due within that time."""
+        """Skip the callbacks due within that time."""
         self._hangs_until_s = self._schedule.monotonic_s() + duration_s
 
     def stop(self) -> None:
-        """Not once more."""
+        """Cancel all further callbacks."""
         self._do = None

@@ -1,4 +1,4 @@
-"""A swarm of robots that share nothing but the medium, in simulated time."""
+"""Swarm of robots that communicate over a medium only, in simulated time."""
 
 import heapq
 import math
@@ -22,7 +22,7 @@ from lpac.sim.vehicles import PointVehicles, VehicleOdometry
 
 
 class SwarmRobot(Protocol):
-    """A robot's steps, as those of `Pac`."""
+    """The steps of a robot, as in `Pac`."""
 
     largest_payload: float
 
@@ -30,15 +30,15 @@ class SwarmRobot(Protocol):
     def table(self) -> NeighbourTable: ...
     @property
     def waits(self) -> bool:
-        """Whether `control` needs something that somebody else has still to compute."""
+        """Whether `control` needs a policy step that is not computed yet."""
 
     def perceive(self, now_s: float) -> object: ...
     def control(self, now_s: float) -> F64 | None: ...
     def say(self, now_s: float) -> Any:
-        """Decide; its message to its neighbours, None if it has none."""
+        """Run the policy; returns the message to neighbours, or None."""
 
     def hear(self, message: Any, now_s: float) -> None:
-        """Take in another's message."""
+        """Receive another robot's message."""
 
 
 AnyRobot = TypeVar("AnyRobot", bound=SwarmRobot)
@@ -58,10 +58,9 @@ class Swarm(Generic[AnyRobot]):
         failures: Sequence[Failure] = (),
         bias_m: F64 | None = None,
     ) -> None:
-        """`boot` makes a robot of its number, start, from 1 on, and odometry, at each start.
+        """`boot` makes a robot from its id, start count (from 1) and odometry, at each start.
 
-        `rng` draws the clocks' phases; `bias_m` (N, 2) is by how much the robots' knowledge of
-        their positions is wrong.
+        `rng` draws the clocks' phases; `bias_m` (N, 2) is the position error of the robots.
         """
         self._boot = boot
         self._vehicles = vehicles
@@ -90,14 +89,14 @@ class Swarm(Generic[AnyRobot]):
         """
         for until_s in times_s:
             for _ in self.advance(until_s):
-                raise RuntimeError("a robot waits, and nobody computes what for")
+                raise RuntimeError("a robot waits for a policy step that is never computed")
             yield self.positions_m()
 
     def advance(self, until_s: float) -> Iterator[None]:
-        """Move on to that time; yields whenever a robot waits, and goes on when it no more does."""
+        """Advance to that time; yields while a robot waits for its policy."""
         while True:
             tick = self._next_tick
-            # Of equal times the tick is first: what it leads to comes after it.
+            # At equal times the tick comes first, since it may cause the event.
             if self._events and self._events[0][0] < tick.time_s:
                 if self._events[0][0] > until_s:
                     break
@@ -128,11 +127,11 @@ class Swarm(Generic[AnyRobot]):
         return self._vehicles.positions_m()
 
     def velocities_m_s(self) -> F64:
-        """The velocities (N, 2) that the vehicles are told now."""
+        """The velocities (N, 2) commanded now."""
         return self._vehicles.velocities_m_s()
 
     def heard(self, now_s: float) -> Bools:
-        """(N, N), [receiver, sender]: whose message a robot has that is fresh; takes none away."""
+        """(N, N), [receiver, sender]: whether a robot holds a fresh message; none is consumed."""
         heard = np.zeros((len(self.robots),) * 2, np.bool_)
         for receiver, robot in enumerate(self.robots):
             heard[receiver, [near.beacon.robot_id for near in robot.table.neighbours(now_s)]] = True
@@ -140,18 +139,18 @@ class Swarm(Generic[AnyRobot]):
 
     @property
     def alive(self) -> Bools:
-        """(N,): who has not failed now."""
+        """(N,): whether each robot is alive now."""
         alive = np.ones(len(self.robots), np.bool_)
         alive[list(self._failed)] = False
         return alive
 
     @property
     def largest_payload(self) -> float:
-        """The largest number in a payload that a robot has heeded, by its absolute value."""
+        """The largest absolute value in a payload that a robot used."""
         return max(robot.largest_payload for robot in (*self.robots, *self._gone))
 
     def message_counts(self) -> dict[str, int]:
-        """Broadcasts, and what became of them at each receiver in range, in all."""
+        """Totals of broadcasts, and of their outcomes at the receivers in range."""
         counts = Counter({"broadcasts": self._medium.broadcasts, "lost": self._medium.lost})
         for robot in (*self.robots, *self._gone):
             counts.update(robot.table.counts())
@@ -196,19 +195,19 @@ class _Message(NamedTuple):
 
 
 class ClockedPac(Pac):
-    """A robot of a fleet that has one clock."""
+    """Robot of a fleet with one shared clock."""
 
     waits = False
     largest_payload = 0.0
 
     def __init__(self, *, start: int, **pac: Any) -> None:
-        """`start` tells this start of its program from others; the rest is as `Pac` has it."""
+        """`start` identifies this start of the program; the rest is passed to `Pac`."""
         super().__init__(**pac)
         self._start = start
         self._said = 0
 
     def say(self, now_s: float) -> _Message | None:
-        """See `SwarmRobot`. Raises PartError for whatever policy and sensor do wrong."""
+        """See `SwarmRobot`. Raises PartError if the policy or the sensor fails."""
         self._tell_time(now_s)
         tick = self.infer(now_s)
         if self.problem:

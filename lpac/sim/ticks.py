@@ -1,4 +1,4 @@
-"""When the loops of a swarm's robots tick."""
+"""Tick times of the robots' loops."""
 
 import heapq
 from collections.abc import Iterator
@@ -17,9 +17,9 @@ Loop = Literal["perception", "policy", "control"]
 class Clocks(Bounded):
     """Periods of a robot's three loops, s; a tick is early or late by up to `jitter` periods.
 
-    With `synchronous` all robots' loops begin at once, and none is ever early or late.
+    With `synchronous` all loops start at once, without jitter.
 
-    Raises ValueError that names what is impossible.
+    Raises ValueError that names the invalid field.
     """
 
     perception_s: Positive = 0.2
@@ -30,7 +30,7 @@ class Clocks(Bounded):
 
 
 class LoopTick(NamedTuple):
-    """A loop of one robot ticks."""
+    """One tick of a robot's loop."""
 
     time_s: float
     loop: Loop
@@ -38,10 +38,10 @@ class LoopTick(NamedTuple):
 
 
 def ticks(robots: int, clocks: Clocks, rng: np.random.Generator) -> Iterator[LoopTick]:
-    """All ticks of so many robots in the order of time, for ever, on absolute deadlines.
+    """All ticks of the robots in the order of time, without end, on absolute deadlines.
 
-    `rng` draws the phases at once, and the lateness of a robot's next tick when the one before has
-    been handed out: what happens in a flight has no part in it.
+    `rng` draws the phases first, then the lateness of a robot's next tick after each tick. The
+    flight has no influence on them.
     """
     # (time, order, due, period, tick); the order makes equal times deterministic.
     heap: list[tuple[float, int, float, float, Loop, int]] = []

@@ -1,8 +1,8 @@
-"""How flights of the shipped policy usually end: what a single flight is compared with.
+"""Usual results of the shipped policy, with which single flights are compared.
 
-A flight's *ratio* is its coverage cost J at the end over what Lloyd's algorithm comes to that knows
-the whole world, from where the robots truly are. `usual.json` has the range of eight flights in
-ten; `python -m bench usual` flies them and writes it.
+A flight's *ratio* is its final coverage cost J over the one that Lloyd's algorithm reaches with
+full knowledge of the world, from the robots' true positions. `usual.json` has the range of eight
+flights in ten; `python -m bench usual` flies them and writes it.
 """
 
 import json
@@ -17,13 +17,13 @@ from edge.core.counted import counted
 from lpac.sim.scenario import Scenario
 
 USUAL_JSON = Path(__file__).with_suffix(".json")
-# What was flown: points as `lpac demo` has them, and whole robots with errors of their receivers.
+# The scenarios flown: points as in `lpac demo`, and whole robots with receiver errors.
 POINTS, WHOLE = Scenario(), Scenario(duration_s=50.0)
 _SHARES = (0.1, 0.9)
 
 
 class Usual(NamedTuple):
-    """Of `flights` flights of so many robots, eight in ten ended with a ratio in this range."""
+    """Range of the final ratio of eight in ten flights with that many robots."""
 
     robots: int
     flights: int
@@ -37,14 +37,14 @@ class Usual(NamedTuple):
 
 
 def usual_points(scenario: Scenario, bundle_id: str) -> Usual | None:
-    """None if nothing like it was flown."""
+    """Usual results of such a flight of points; None if none were measured."""
     if replace(scenario, seed=POINTS.seed) != POINTS:
         return None
     return _nearest("points", scenario.robots, bundle_id)
 
 
 def usual_whole(scenario: Scenario, bundle_id: str) -> Usual | None:
-    """Of the nearest number of robots that was flown; None if nothing like it was."""
+    """Usual results for the nearest number of whole robots; None if none were measured."""
     alike = replace(
         WHOLE, seed=scenario.seed, robots=scenario.robots, duration_s=scenario.duration_s,
         secure=scenario.secure, transport=scenario.transport,
@@ -64,7 +64,7 @@ def _nearest(what: str, robots: int, bundle_id: str) -> Usual | None:
 
 
 def judgement(ratio: float, usual: Usual | None) -> str:
-    """Whether a flight with that ratio is good, for people."""
+    """Text that compares a flight's ratio with the usual ones."""
     said = f"{ratio:.2f} times the cost of Lloyd's algorithm, which knows the whole world"
     if usual is None:
         return f"is that good? {said}"

@@ -1,4 +1,4 @@
-"""Point vehicles that fly the velocity that they are told, inside the world."""
+"""Point vehicles that follow velocity commands inside the world."""
 
 import math
 
@@ -12,26 +12,26 @@ from edge.core.schema import NonNegative, require
 class PointVehicles:
     """N planar vehicles in the mission frame, m and s.
 
-    The world's border holds a vehicle as a wall would; one that starts outside may come back in
-    and go no further out.
+    The world's border stops a vehicle like a wall; one that starts outside may come back in, but
+    go no further out.
     """
 
     def __init__(self, positions_m: F64, world_size_m: float, lag_s: float = 0.0) -> None:
         """`positions_m` is (N, 2), at time 0.
 
-        `lag_s` is the time constant of the first order with which a vehicle's velocity follows the
-        one that it is told; 0: at once. Raises ValueError if it is not finite and at least 0.
+        `lag_s` is the first-order time constant with which a velocity follows its command; 0: no
+        lag. Raises ValueError if it is not finite and at least 0.
         """
         require(NonNegative, lag_s, "lag_s")
-        # (2, N) each, so that what is computed of all runs along the memory.
+        # (2, N) each: operations on all vehicles then run along contiguous memory.
         self._start_m = np.ascontiguousarray(positions_m.T)
         self._velocity_m_s = np.zeros_like(self._start_m)
-        # What is left, of the velocity before, of its difference from the one that was told.
+        # Velocity before the command, minus the command.
         self._excess_m_s = np.zeros_like(self._start_m)
         self._since_s = np.zeros(len(positions_m))
         self._world_size_m = world_size_m
         self._lag_s = lag_s
-        # The caller moves the time on, never back.
+        # Set by the caller; it never decreases.
         self.now_s = 0.0
 
     def positions_m(self) -> F64:
@@ -43,15 +43,15 @@ class PointVehicles:
         return self._now_m(robot)
 
     def velocities_m_s(self) -> F64:
-        """The velocities (N, 2) that the vehicles were told."""
+        """Commanded velocities (N, 2)."""
         return self._velocity_m_s.T.copy()
 
     def velocity_m_s(self, robot: int) -> F64:
-        """The velocity (2,) that one vehicle was told."""
+        """Commanded velocity (2,) of one vehicle."""
         return self._velocity_m_s[:, robot]
 
     def fly(self, robot: int, velocity_m_s: F64) -> None:
-        """From now on the vehicle is told `velocity_m_s` (2,)."""
+        """Command the velocity (2,) from now on."""
         self._start_m[:, robot] = self.position_m(robot)
         if self._lag_s:
             left = math.exp(-(self.now_s - self._since_s[robot]) / self._lag_s)
@@ -61,7 +61,7 @@ class PointVehicles:
         self._velocity_m_s[:, robot] = velocity_m_s
 
     def stop(self, robot: int) -> None:
-        """The vehicle stands still at once."""
+        """Stop the vehicle at once."""
         self.fly(robot, np.zeros(2))
         self._excess_m_s[:, robot] = 0.0
 
@@ -77,16 +77,16 @@ class PointVehicles:
 
 
 class VehicleOdometry:
-    """OdometrySource of one vehicle, with the position error that its robot receives."""
+    """OdometrySource of one vehicle, with a constant position error."""
 
     def __init__(self, vehicles: PointVehicles, robot: int, bias_m: F64 | None = None) -> None:
-        """`bias_m` (2,) is by how much what it is told of its position is wrong, all the time."""
+        """`bias_m` (2,) is added to the true position."""
         self._vehicles = vehicles
         self._robot = robot
         self._bias_m = bias_m
 
     def odometry(self) -> Odometry:
-        """The truth, but for the bias; the vehicles are planar."""
+        """True state plus the bias; the vehicles are planar."""
         position_m = self._vehicles.position_m(self._robot)
         if self._bias_m is not None:
             position_m = position_m + self._bias_m

@@ -56,7 +56,7 @@ def test_a_fleet_is_stopped_before_it_takes_off() -> None:
     flown = fly(scenario, SHIPPED, lambda moment: moment.stop(), engine="simulated")
     assert not (flown.took_off or flown.flew_mission)
     assert flown.script.problem is not None and flown.script.problem.endswith("stopped")
-    with pytest.raises(ValueError, match="fault = landed: such a flight is not watched"):
+    with pytest.raises(ValueError, match="fault = landed: cannot be watched"):
         fly(scenario_of(FAULTS["landed"], 0, 2), SHIPPED, print, engine="simulated")
 
 

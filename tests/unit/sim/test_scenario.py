@@ -41,7 +41,7 @@ def test_points_have_no_vehicles_sensors_or_keys(field: str, asked: Any, named: 
         (Scenario(lag_s=0.5), "lag_s = 0.5: must be 0.0 for whole robots"),
         (Scenario(payload="int8"), "payload = int8: must be float16 for whole robots"),
         (Scenario(clocks=Clocks(synchronous=True)), "synchronous = True: must be False for whole"),
-        (Scenario(failures=(Failure(1, 5.0),)), "robot 1 is lost: whole robots can only be away"),
+        (Scenario(failures=(Failure(1, 5.0),)), "failures: robot 1 has no until_s: whole robots"),
         (Scenario(robots=31), "robots = 31: must be from 1 to 30"),
     ],
 )
@@ -61,7 +61,7 @@ def test_whole_robots_fly_as_they_do_in_the_field(scenario: Scenario, named: str
         ("simulated", Scenario(fault="nothing"), "fault = nothing: there is none"),
         ("mavlink", Scenario(fault="radio-dies"), "fault = radio-dies: is not flown with mavlink"),
         ("nonsense", Scenario(), "engine = 'nonsense': allowed are 'point', 'simulated'"),
-        ("px4", Scenario(), "px4: needs PX4's build folder"),
+        ("px4", Scenario(), "engine = 'px4': needs PX4's build folder"),
     ],
 )
 def test_an_engine_says_what_it_cannot_do(
