@@ -1,4 +1,4 @@
-"""How commands speak to the ground, and what a person sees of it: who does what, then a table."""
+"""Requests to the ground, with progress and a table of the results."""
 
 import dataclasses
 import json
@@ -27,7 +27,7 @@ ListenSeconds = Annotated[
 
 
 class Addressed(NamedTuple):
-    """A fleet's name and file, and the robots that are meant; () are all that sit in a slot."""
+    """A fleet's name and file, and the addressed robots; () means all robots with a slot."""
 
     fleet: str
     path: Path
@@ -49,9 +49,9 @@ Details = Mapping[str, Mapping[str, object]]
 def ask(
     to: Addressed, request: "Request", name: str, *, as_json: bool, details: Details | None = None
 ) -> None:
-    """Have a command done; print who did what, and who refused and why.
+    """Send a command, and print each robot's result.
 
-    `details` are more columns, by robot and heading. Raises ValueError unless all did it.
+    `details` are more columns, by robot and heading. Raises ValueError unless all succeeded.
     """
     from lpac.ground.station.client import command
     from lpac.ground.station.protocol import SafetyCommand
@@ -69,7 +69,7 @@ def ask(
 def show(
     to: Addressed, report: "CommandReport", name: str, *, as_json: bool, details: Details
 ) -> None:
-    """Print a command's report. Raises ValueError unless all did it."""
+    """Print a command's report. Raises ValueError unless all succeeded."""
     from edge.core.counted import counted
 
     if as_json:
@@ -102,19 +102,17 @@ def show(
         )
 
 
-@contextmanager
-def looking(to: Addressed) -> Iterator["GroundSubscriber"]:
-    """Subscribe to the ground, as long as this context lasts. Raises GroundError."""
+def subscribe(to: Addressed) -> "GroundSubscriber":
+    """Subscribe to the ground; returns a context manager. Raises GroundError."""
     from lpac.ground.station.subscriber import GroundSubscriber
 
-    with GroundSubscriber(to.fleet) as subscriber:
-        yield subscriber
+    return GroundSubscriber(to.fleet)
 
 
 def measure(
     subscriber: "GroundSubscriber", robots: Sequence[str], seconds: float
 ) -> dict[str, "Standing"]:
-    """Average the robots' positions and headings. Raises ValueError, one line, if one has none."""
+    """Average the robots' positions and headings. Raises ValueError if one is missing."""
     from lpac.ground.procedure import gather
     from lpac.ground.site import standing
     from lpac.ground.station.subscriber import addressed
@@ -128,7 +126,7 @@ def measure(
 
 @contextmanager
 def interruptible(name: str, left: str = "") -> Iterator[None]:
-    """Ctrl-C ends the command in one line, and exit code 130; `left` says what goes on."""
+    """On Ctrl-C, print one line and exit with code 130; `left` says what continues."""
     try:
         yield
     except KeyboardInterrupt:
@@ -138,7 +136,7 @@ def interruptible(name: str, left: str = "") -> Iterator[None]:
 
 
 def confirm(question: str, name: str, *, yes: bool) -> None:
-    """Let a person decide, unless they have. Raises ValueError if they do not want it."""
+    """Ask for confirmation, unless `yes`. Raises ValueError if it is denied."""
     if yes:
         return
     if not sys.stdin.isatty():
@@ -148,13 +146,13 @@ def confirm(question: str, name: str, *, yes: bool) -> None:
 
 
 def print_json(mapping: dict[str, object]) -> None:
-    """One object on stdout."""
+    """Print one object on stdout."""
     typer.echo(json.dumps(mapping, indent=2))
 
 
 @contextmanager
 def _progress() -> Iterator[Callable[["CommandProgress"], None]]:
-    """On stderr: a live table, or a line for each step where there is no terminal."""
+    """Progress on stderr: a live table, or a line per step without a terminal."""
     told: dict[str, str] = {}
 
     def table() -> "Table":

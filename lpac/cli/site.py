@@ -13,10 +13,10 @@ from lpac.cli.ground_requests import (
     ListenSeconds,
     address,
     interruptible,
-    looking,
     measure,
     print_json,
     show,
+    subscribe,
 )
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots
 from lpac.cli.printing import BAD, print_table, styled
@@ -33,11 +33,12 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="The site's name.")]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SiteOptions:
-    """Options of a site that is saved."""
+    """Options of `lpac site save`."""
 
     name: Name
     from_robot: Annotated[
-        str, typer.Option("--from", help="The origin is where this robot stands; else as it is.")
+        str,
+        typer.Option("--from", help="Take this robot's position as origin; else the present one."),
     ] = ""
     toward: Annotated[str, "The y axis points to this robot; with --from."] = ""
     land_at_pads: Annotated[bool, "Robots land where they stand now."] = False
@@ -48,9 +49,9 @@ class SiteOptions:
 @app.command()
 @options_of(SiteOptions, OfFleet)
 def save(site: SiteOptions, of: OfFleet) -> None:
-    """Save origin, fence, and as pads where the robots of the slots stand now.
+    """Save origin, fence, and the present positions of the slots' robots as pads.
 
-    Nothing is told to the robots: `lpac site use NAME` does that.
+    The robots get nothing until `lpac site use NAME`.
     """
     from lpac.ground.site import Sites
 
@@ -73,7 +74,7 @@ def _as_it_stands(to: Addressed, site: SiteOptions) -> "SavedSite":
     from lpac.ground.site import site_as_it_stands
     from lpac.ground.station.subscriber import addressed
 
-    with looking(to) as subscriber:
+    with subscribe(to) as subscriber:
         names = addressed(subscriber.setup, to.robots)
         measured = {*names, *filter(None, (site.from_robot, site.toward))}
         stands = measure(subscriber, sorted(measured), site.seconds)
@@ -91,14 +92,14 @@ def _as_it_stands(to: Addressed, site: SiteOptions) -> "SavedSite":
 def use(
     name: Name, fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False
 ) -> None:
-    """Have the fleet fly at a site: its origin, fence and landing points. Refused in flight."""
+    """Send a site's origin, fence and landing points to the fleet. Refused in flight."""
     from lpac.ground.script import take_site
     from lpac.ground.site import Sites
 
     to = address(fleet, robots)
     sites = Sites(to.path)
     site = sites.load(name)
-    with looking(to) as subscriber, interruptible("site use"):
+    with subscribe(to) as subscriber, interruptible("site use"):
         report = subscriber.carry_out(take_site(site, subscriber.setup, to.robots))
     if report.problem is None:
         sites.use(name)
@@ -107,7 +108,7 @@ def use(
 
 @app.command("list")
 def list_(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
-    """Show the sites that were saved, and which was used last."""
+    """List the saved sites, and mark the last used one."""
     from lpac.ground.site import Sites
 
     sites = Sites(address(fleet, None).path)

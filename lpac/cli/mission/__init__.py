@@ -1,9 +1,9 @@
 """`lpac mission`: command the fleet."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,8 +16,8 @@ from lpac.cli.ground_requests import (
     ask,
     confirm,
     interruptible,
-    looking,
     measure,
+    subscribe,
 )
 from lpac.cli.mission.rehearse import rehearse
 from lpac.cli.mission.run import run
@@ -30,26 +30,28 @@ if TYPE_CHECKING:
 app = new_app(
     "mission", "Command the fleet, through `lpac ground`. Done when every robot has answered."
 )
-# Negative numbers are no options.
+# Negative coordinates must not be parsed as options.
 _NUMBERS = {"ignore_unknown_options": True}
 
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
-Wait = Annotated[bool, typer.Option("--wait", help="Until all have landed.")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OfAll(OfFleet):
-    """Options of a command for all: the state's origin, fence and world are the whole fleet's."""
+    """Options of a command for the whole fleet, which shares one origin, fence and world."""
 
     robots: Annotated[
         str | None,
-        typer.Option("--robots", help="Sent to all; only these must accept it, such as r1,r3."),
+        typer.Option(
+            "--robots",
+            help="Wait for these robots only, such as r1,r3; all robots get the command.",
+        ),
     ] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Named(OfFleet):
-    """Options of a command for robots by name or by --robots; else for all."""
+    """Options of a command for robots by name or by --robots; all robots by default."""
 
     names: Annotated[
         list[str] | None, typer.Argument(metavar="[ROBOT...]", help="The robots; else all.")
@@ -57,8 +59,15 @@ class Named(OfFleet):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Landing(Named):
+    """Options of a command that ends on the ground."""
+
+    wait: Annotated[bool, typer.Option("--wait", help="Wait until all have landed.")] = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OnlyNamed(Named):
-    """The same of a command that is never meant for all."""
+    """Options of a command that requires robots to be named."""
 
     names: Annotated[
         list[str] | None, typer.Argument(metavar="ROBOT...", help="The robots; never all.")
@@ -67,7 +76,7 @@ class OnlyNamed(Named):
 
 
 def _named(of: Named, command: str) -> Addressed:
-    """Resolve the robots of a command that takes their names as well as --robots."""
+    """Resolve names or --robots. Raises ValueError for both, or for neither with `OnlyNamed`."""
     if of.names and of.robots is not None:
         raise ValueError("give the robots' names or --robots, not both")
     to = address(of.fleet, ",".join(of.names) if of.names else of.robots)
@@ -76,9 +85,6 @@ def _named(of: Named, command: str) -> Addressed:
             f"{command}: name the robots, such as `lpac mission {command} r3`: it is never for all"
         )
     return to
-
-
-# Where
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +98,7 @@ class OriginOptions:
         typer.Argument(metavar="HEADING_DEG", help="Of the y axis, from true north, [0, 360)."),
     ] = None
     from_robot: Annotated[
-        str, typer.Option("--from", help="Where this robot stands, and y where its nose points.")
+        str, typer.Option("--from", help="This robot's position; y points along its nose.")
     ] = ""
     toward: Annotated[str, "The y axis points to this robot; with --from."] = ""
     seconds: Annotated[
@@ -103,7 +109,7 @@ class OriginOptions:
 @app.command(context_settings=_NUMBERS)
 @options_of(OriginOptions, OfAll)
 def origin(given: OriginOptions, of: OfAll) -> None:
-    """Set where the mission frame lies: LAT LON HEADING_DEG, or as a robot stands (--from)."""
+    """Set the mission frame's origin: LAT LON HEADING_DEG, or a robot's pose (--from)."""
     from lpac.ground.station.protocol import SetOrigin
 
     to = address(of.fleet, of.robots)
@@ -121,7 +127,7 @@ def _measured_origin(to: Addressed, given: OriginOptions) -> "Origin":
 
     if given.latitude is not None:
         raise ValueError("origin: give LAT LON HEADING_DEG, or --from ROBOT, not both")
-    with looking(to) as subscriber:
+    with subscribe(to) as subscriber:
         robots = [given.from_robot, *filter(None, [given.toward])]
         stands = measure(subscriber, robots, given.seconds)
     first, second = stands[given.from_robot], stands.get(given.toward)
@@ -131,7 +137,7 @@ def _measured_origin(to: Addressed, given: OriginOptions) -> "Origin":
 
 
 def _given_origin(to: Addressed, given: OriginOptions) -> "Origin":
-    """Says so if it is far from the robots."""
+    """Read LAT LON HEADING_DEG; warn if it is far from the robots."""
     from edge.messages.mission import Origin
     from lpac.ground.site import FAR_M, furthest_m
 
@@ -143,7 +149,7 @@ def _given_origin(to: Addressed, given: OriginOptions) -> "Origin":
         where = Origin(given.latitude, given.longitude, given.heading)
     except ValueError as error:
         raise ValueError(f"origin: {error}") from None
-    with looking(to) as subscriber:
+    with subscribe(to) as subscriber:
         far_m = furthest_m(where, subscriber.snapshot)
     if far_m > FAR_M:
         typer.echo(f"NOTE: robots are up to {far_m / 1e3:.1f} km from this origin", err=True)
@@ -171,7 +177,7 @@ app.add_typer(fence)
 @fence.command("on")
 @options_of(OfAll)
 def fence_on(of: OfAll) -> None:
-    """Each robot's configured fence again."""
+    """Restore each robot's configured fence."""
     from lpac.ground.station.protocol import SetFence
 
     to = address(of.fleet, of.robots)
@@ -181,7 +187,7 @@ def fence_on(of: OfAll) -> None:
 @fence.command("off")
 @options_of(OfAll)
 def fence_off(of: OfAll, *, yes: Yes = False) -> None:
-    """A square of 200 m around the origin only: nothing keeps the robots near. Asks first."""
+    """Widen the fence to a square of 200 m around the origin. Asks first."""
     from lpac.ground.site import WIDE_FENCE_M, wide_fence
     from lpac.ground.station.protocol import SetFence
 
@@ -191,7 +197,7 @@ def fence_off(of: OfAll, *, yes: Yes = False) -> None:
         "fence off",
         yes=yes,
     )
-    with looking(to) as subscriber:
+    with subscribe(to) as subscriber:
         wide = wide_fence(subscriber.setup.fence)
     ask(to, SetFence(wide, to.robots), "fence off", as_json=of.as_json)
 
@@ -210,13 +216,16 @@ def fence_set(
     floor: Annotated[float | None, typer.Option("--floor", help="Lowest height, m.")] = None,
     ceiling: Annotated[float | None, typer.Option("--ceiling", help="Greatest height, m.")] = None,
 ) -> None:
-    """A convex polygon, such as 0,0 32,0 32,32 0,32; the rest as configured unless given."""
+    """Set a convex polygon, such as 0,0 32,0 32,32 0,32.
+
+    Buffer, floor and ceiling stay as configured unless given.
+    """
     from edge.core.fence import Fence as Polygon
     from lpac.ground.station.protocol import SetFence
 
     to = address(of.fleet, of.robots)
     points = tuple(_point(corner) for corner in corners)
-    with looking(to) as subscriber:
+    with subscribe(to) as subscriber:
         configured = subscriber.setup.fence
     try:
         polygon = Polygon(
@@ -266,7 +275,7 @@ def assign(
     ] = "",
     seconds: ListenSeconds = 2.0,
 ) -> None:
-    """Give each robot the slot (height, landing point) of the pad where it stands, by GPS.
+    """Assign each robot the slot (height, landing point) of the pad it stands on, by GPS.
 
     Refused if a robot is more than 3 m from every pad, if another pad is less than 1 m further than
     the nearest, or if two robots stand at one pad.
@@ -277,7 +286,7 @@ def assign(
     from lpac.ground.station.subscriber import addressed
 
     to = address(of.fleet, of.robots)
-    with looking(to) as subscriber:
+    with subscribe(to) as subscriber:
         setup, ground = subscriber.setup, subscriber.snapshot.ground
         names = addressed(setup, to.robots)
         if ground is None or ground.origin is None:
@@ -295,24 +304,24 @@ def assign(
     ask(to, SetPlaces(places), "assign", as_json=of.as_json, details=details)
 
 
-# Flying
-
-
 def _add(name: str, about: str, options: type[Named] = Named) -> None:
-    """Add a command for robots that asks for one thing."""
+    """Add a command that sends one request to robots."""
 
     @options_of(options)
     def command(of: Named) -> None:
-        from lpac.ground.station.protocol import of_robots
+        from lpac.ground.station.protocol import SafetyCommand, of_robots
 
         to = _named(of, name)
-        ask(to, of_robots(name, to.robots), name, as_json=of.as_json)
+        request = of_robots(name, to.robots)
+        if isinstance(of, Landing) and isinstance(request, SafetyCommand):
+            request = replace(request, wait=of.wait)
+        ask(to, request, name, as_json=of.as_json)
 
     app.command(name, help=about)(command)
 
 
-_add("enable", "Let the robots run their checks, and fly.")
-_add("disable", "Let the robots fly no more: those in the air hold.")
+_add("enable", "Allow the robots to run their checks and fly.")
+_add("disable", "Forbid the robots to fly; those in the air hold.")
 
 
 @app.command()
@@ -324,13 +333,13 @@ def takeoff(
         float, typer.Option("--interval", min=0, max=60, help="Between two robots, s.")
     ] = 2.0,
     abort_on_failure: Annotated[
-        bool, typer.Option("--abort-on-failure", help="Nobody else takes off once one has failed.")
+        bool, typer.Option("--abort-on-failure", help="Start no more robots once one has failed.")
     ] = False,
     yes: Yes = False,
 ) -> None:
     """Take off, the highest first; done when all hold at their heights.
 
-    Asks first at a terminal. A script, which has none, means it.
+    Asks first at a terminal; without one it starts at once.
     """
     from lpac.ground.station.protocol import Takeoff
 
@@ -345,35 +354,14 @@ def takeoff(
 
 
 _add("start", "Fly the mission, from hold.")
-_add("hold", "Stay where they are. Anybody may command it.")
-_add("resume", "Withdraw hold, return or land; robots that flew the mission fly it again.")
-
-
-@app.command()
-@options_of(Named)
-def land(of: Named, *, wait: Wait = False) -> None:
-    """Land where they are."""
-    _bring_down("land", of, wait=wait)
-
-
-@app.command("return")
-@options_of(Named)
-def return_(of: Named, *, wait: Wait = False) -> None:
-    """Fly to the landing points at their own heights, and land there, the lowest first."""
-    _bring_down("return", of, wait=wait)
-
-
-def _bring_down(safety_action: Literal["return", "land"], of: Named, *, wait: bool) -> None:
-    from lpac.ground.station.protocol import SafetyCommand
-
-    to = _named(of, safety_action)
-    request = SafetyCommand(safety_action, to.robots, wait)
-    ask(to, request, safety_action, as_json=of.as_json)
-
-
-# One robot at a time
-
-
+_add("hold", "Hold position. Any ground station may command it.")
+_add("resume", "Cancel hold, return or land; robots that flew the mission fly it again.")
+_add("land", "Land at the present position.", Landing)
+_add(
+    "return",
+    "Fly to the landing points at their own heights, and land there, the lowest first.",
+    Landing,
+)
 _add(
     "pilot", "Hand robots to human pilots, by name: the program commands nothing until `rejoin`.",
     OnlyNamed,
@@ -391,7 +379,7 @@ def disarm(of: Named) -> None:
     to = _named(of, "disarm")
     names = to.robots
     if not names:
-        with looking(to) as subscriber:
+        with subscribe(to) as subscriber:
             names = addressed(subscriber.setup, ())
     ask(to, RobotCommand("disarm", names), "disarm", as_json=of.as_json)
 
@@ -407,9 +395,6 @@ def kill(of: OnlyNamed, *, yes: Yes = False) -> None:
     ask(to, RobotCommand("kill", to.robots), "kill", as_json=of.as_json)
 
 
-# Trials, and who commands
-
-
 @app.command()
 @options_of(OfFleet)
 def again(
@@ -419,7 +404,7 @@ def again(
         str, typer.Argument(metavar="[TRIAL]", help="Its name; else the next number.")
     ] = "",
 ) -> None:
-    """Begin the next trial: explored maps and neighbours' messages are forgotten."""
+    """Begin the next trial: robots discard explored maps and neighbours' messages."""
     from lpac.ground.station.protocol import NextTrial
 
     to = address(of.fleet, of.robots)

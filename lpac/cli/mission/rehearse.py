@@ -1,4 +1,4 @@
-"""`lpac mission rehearse`: carry a robot over the field, and see what it believes and would do."""
+"""`lpac mission rehearse`: carry a robot over the field, and see its position and command."""
 
 import json
 import math
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.ground_requests import address, looking
+from lpac.cli.ground_requests import address, subscribe
 from lpac.cli.options import DEFAULT_FLEET, Fleet, Robots
 from lpac.cli.printing import BAD, FAINT, NOTABLE, styled
 
@@ -32,14 +32,14 @@ def rehearse(
         bool, typer.Option("--json", help="Print one JSON object a line, once a second.")
     ] = False,
 ) -> None:
-    """Show where disarmed robots believe they are, and where the policy would fly them.
+    """Show disarmed robots' estimated positions, and where the policy would fly them.
 
-    The arrow is meant in the mission frame, y up; the words from the robot's nose.
+    The arrow is in the mission frame, y up; the words are relative to the robot's nose.
     """
     from lpac.ground.station.subscriber import addressed
 
     to = address(fleet, robots)
-    with looking(to) as subscriber:
+    with subscribe(to) as subscriber:
         names = addressed(subscriber.setup, to.robots)
         _require_disarmed(subscriber, names)
         try:
@@ -108,7 +108,7 @@ def _table(subscriber: "GroundSubscriber", names: "Sequence[str]") -> "Table":
 
 
 def _line(row: "list[Text]") -> str:
-    """A row with what stands above and beside it in the table: "r1: x 4.5 m, y 2.0 m, ..."."""
+    """A row of the table as text: "r1: x 4.5 m, y 2.0 m, ..."."""
     robot, *cells = map(str, row)
     if len(cells) < len(_HEADINGS) - 1:
         return f"{robot}: {cells[0]}"

@@ -1,4 +1,4 @@
-"""`lpac mission run`: fly a script, and show how far it is."""
+"""`lpac mission run`: fly a script, and show its progress."""
 
 import json
 import signal
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.ground_requests import address, looking
+from lpac.cli.ground_requests import address, subscribe
 from lpac.cli.options import DEFAULT_FLEET, Fleet
 from lpac.cli.printing import LiveView
 
@@ -39,7 +39,7 @@ def run(
 ) -> None:
     """Fly a script: origin, world, and trials from preflight to landing.
 
-    If a step fails, and at Ctrl-C, the fleet is told to hold. Before each further trial it asks.
+    If a step fails, or on Ctrl-C, the fleet is ordered to hold. Asks before each further trial.
     """
     from lpac.ground.script import ScriptRun, load_script
     from lpac.ground.site import Sites
@@ -49,10 +49,10 @@ def run(
     loaded = load_script(script, sites)
     if loaded.trials > 1 and not yes:
         _require_terminal(f"{script}: trials = {loaded.trials}")
-    # A terminal that is closed ends a script as Ctrl-C does.
+    # Closing the terminal ends a script as Ctrl-C does.
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
-    with looking(to) as subscriber:
+    with subscribe(to) as subscriber:
         view = _View(subscriber, yes, as_json)
         problem, code = _fly(ScriptRun(loaded, sites, subscriber, view), view)
     typer.echo(f"lpac: {script}: {problem}" if problem else f"{script}: done", err=True)
@@ -70,7 +70,7 @@ def _require_terminal(which: str) -> None:
 
 
 def _fly(flight: "ScriptRun", view: "_View") -> tuple[str, int]:
-    """The problem, if there was one, and the exit code."""
+    """Fly, and return the problem ("" if none) and the exit code."""
     from lpac.ground.script import ScriptError
     from lpac.ground.station.client import GroundError
 
@@ -85,15 +85,15 @@ def _fly(flight: "ScriptRun", view: "_View") -> tuple[str, int]:
     except GroundError as error:
         return f"{error}; robots in the air hold by themselves, and then land", 1
     except (KeyboardInterrupt, typer.Abort, OSError, SystemExit) as error:
-        # A question is aborted. A terminal that is gone cannot be written to; rich exits when its
-        # pipe breaks.
+        # typer aborts at a question, a closed terminal raises OSError, and rich exits when its pipe
+        # breaks.
         why = str(error) if isinstance(error, OSError) else "interrupted"
         return f"{why}; {carry_out(flight.hold())}", 130
     return "", 0
 
 
 class _View:
-    """On stderr: step, time left, and robots on a terminal; a line for each step elsewhere."""
+    """Progress on stderr: step, time left and robots on a terminal, else a line per step."""
 
     def __init__(self, subscriber: "GroundSubscriber", yes: bool, as_json: bool) -> None:
         self.subscriber = subscriber
@@ -101,26 +101,26 @@ class _View:
         self._yes, self._as_json = yes, as_json
         self._step, self._step_began_s = "", time.monotonic()
         self._at_most_s: float | None = None
-        # On a terminal it would take what is printed to stdout to itself.
+        # A live view on a terminal would capture the JSON on stdout.
         self._view = LiveView(self._render, self._how_far, live=not as_json)
         self.shown, self.line = self._view.shown, self._view.line
 
     def step(self, name: str, at_most_s: float | None) -> None:
-        """A step begins, and the one before is done."""
+        """Begin a step, and end the one before."""
         self.end_step()
         self._step, self._at_most_s = name, at_most_s
         self._step_began_s = time.monotonic()
         self.line(name if at_most_s is None else f"{name}, {at_most_s:g} s")
 
     def end_step(self) -> None:
-        """The step is done, if there is one."""
+        """End the present step, if there is one."""
         if self._as_json and self._step:
             duration_s = round(time.monotonic() - self._step_began_s, 3)
             typer.echo(json.dumps({"step": self._step, "duration_s": duration_s}))
         self._step = ""
 
     def may(self, question: str) -> bool:
-        """Ask the person at the terminal, between two trials."""
+        """Ask at the terminal, between two trials."""
         self.end_step()
         if self._yes:
             return True
@@ -128,7 +128,7 @@ class _View:
             return typer.confirm(question, err=True)
 
     def _how_far(self) -> str:
-        """The step, and what the robots do, in one line."""
+        """One line: the step, and the robots' states."""
         states = Counter(
             "not heard" if robot.status is None or not robot.fresh else robot.status.state.value
             for robot in self.subscriber.snapshot.robots
