@@ -52,6 +52,13 @@ def test_links_lead_somewhere(page: str) -> None:
             assert anchor in anchors(target), (page, link)
 
 
+def test_every_page_is_in_the_navigation() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    named = set(re.findall(r"(\S+\.md)$", navigation, re.M))
+    written = [*pages.hand_written(), *pages.generated()]
+    assert {pages.place(page) for page in written} <= named
+
+
 def test_the_readmes_first_commands_exist_and_tests_are_among_them() -> None:
     section = (ROOT / "README.md").read_text().partition("## Try it")[2].partition("## ")[0]
     told = re.findall(r"(?:^|`)make (\w+)", section, re.M)
