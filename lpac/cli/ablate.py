@@ -1,4 +1,4 @@
-"""`lpac ablate`: what each part of a method is worth."""
+"""`lpac ablate`: what each part of a method contributes."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -32,12 +32,12 @@ def ablate(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for all that is made; out/ablate and the file's name if none."),
+        typer.Option(help="Output folder; out/ablate and the file's name if none."),
     ] = None,
     ray: Ray = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train a method without each of its parts, and say what each of them is worth."""
+    """Train a method without each of its parts, and measure what each contributes."""
     from lpac.ablate.config import read_ablation
     from lpac.ablate.run import AblationRun
     from lpac.ablate.summary import write_report

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from lpac.middleware.results import Experiment, Run, Spread, Summary
 
 app = new_app(
-    "bench",
-    "Measure this machine's network: what the programs send, and what bandwidth they leave.",
+    "bench", "Measure the bandwidth that the robots' programs leave on this machine's network."
 )
 
 _OUT = Path("out/bench/network")

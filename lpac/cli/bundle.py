@@ -1,4 +1,4 @@
-"""`lpac bundle`: look at a bundle, prove that it computes here what it should, measure it."""
+"""`lpac bundle`: show, verify and time a policy bundle."""
 
 import dataclasses
 import json
@@ -12,7 +12,7 @@ from lpac.cli.apps import AsJson, new_app
 if TYPE_CHECKING:
     from edge.policy.bundle import Bundle, Manifest
 
-app = new_app("bundle", "Look at a policy bundle; verify or time it on this machine.")
+app = new_app("bundle", "Show, verify or time a policy bundle on this machine.")
 
 BundlePath = Annotated[
     Path, typer.Argument(metavar="BUNDLE", help="A bundle's directory or .zip archive.")
@@ -21,7 +21,7 @@ BundlePath = Annotated[
 
 @app.command()
 def info(path: BundlePath, as_json: AsJson = False) -> None:
-    """Print what the bundle holds: geometry, perception, training, origin."""
+    """Print the bundle's geometry, perception, training and provenance."""
     from edge.policy.bundle import MANIFEST, load_bundle
 
     bundle = load_bundle(path)
@@ -32,7 +32,7 @@ def info(path: BundlePath, as_json: AsJson = False) -> None:
 
 
 def show(bundle: "Bundle") -> None:
-    """Print a line for each thing that the bundle holds."""
+    """Print a line per property and file of the bundle."""
     manifest, training = bundle.manifest, bundle.manifest.training
     rows = [
         ("name", manifest.name),
@@ -49,7 +49,7 @@ def show(bundle: "Bundle") -> None:
 
 
 def _network(manifest: "Manifest") -> list[tuple[str, str]]:
-    """The geometry of the family lpac, the parameters of others."""
+    """Geometry for the family lpac, parameters for others."""
     from edge.policy.bundle import LPAC
     from edge.policy.lpac.manifest import LpacManifest
 
@@ -82,7 +82,7 @@ def _perception(manifest: "Manifest") -> list[tuple[str, str]]:
 
 @app.command()
 def verify(path: BundlePath, as_json: AsJson = False) -> None:
-    """Check every hash, then compute the bundle's golden outputs again: of graphs and a swarm."""
+    """Check all hashes, then compare this machine's outputs with the bundle's golden outputs."""
     from edge.drivers.registry import load_policy
     from edge.policy.bundle import load_bundle
     from edge.policy.family import TOLERANCE, golden_checks
@@ -114,11 +114,11 @@ def verify(path: BundlePath, as_json: AsJson = False) -> None:
 @app.command()
 def benchmark(
     path: BundlePath,
-    neighbours: Annotated[int, typer.Option(help="How many send to the robot.")] = 10,
+    neighbours: Annotated[int, typer.Option(help="Number of neighbours that send.")] = 10,
     seconds: Annotated[float, typer.Option(help="How long to measure, s.")] = 3.0,
     as_json: AsJson = False,
 ) -> None:
-    """Time the steps of a robot on this machine; fails if one takes over half of its period."""
+    """Time a robot's steps on this machine; fails if one takes over half of its period."""
     from edge.drivers.registry import load_policy
     from edge.policy.bundle import load_bundle
     from edge.robot.benchmark import MOST_OF_PERIOD

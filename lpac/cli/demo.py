@@ -1,4 +1,4 @@
-"""`lpac demo`: what the policy does, beside what others do."""
+"""`lpac demo`: the policy beside the baselines."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,9 +18,9 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the figure and the flights.")] = Path(
         "out/demo"
     ),
-    seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 7,
+    seed: Annotated[int, typer.Option(help="Of world, starts, clocks and losses.")] = 7,
 ) -> None:
-    """Ten robots over an unknown world for 60 s, beside the baselines; makes a figure."""
+    """Fly ten robots and the baselines over an unknown world for 60 s, and draw a figure."""
     from lpac.sim.flight_files import write_demo
     from lpac.sim.scenario import Scenario
     from lpac.sim.usual import judgement, usual_points

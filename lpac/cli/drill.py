@@ -1,4 +1,4 @@
-"""`lpac drill`: faults in flight, and whether what is promised then holds."""
+"""`lpac drill`: faults in flight, and the promises that must hold."""
 
 import shlex
 import signal
@@ -68,15 +68,13 @@ class DrillOptions:
     bundle: Annotated[Path, "Policy bundle."] = DEFAULT_BUNDLE
     sensor: Sensor = DEFAULT_SENSOR
     ray: Ray = None
-    listing: Annotated[bool, typer.Option("--list", help="Only say which faults there are.")] = (
-        False
-    )
+    listing: Annotated[bool, typer.Option("--list", help="Only list the faults.")] = False
     as_json: AsJson = False
     out: Annotated[
         Path | None,
         typer.Option(
-            help=f"Folder for drill.json, drill.csv, README.md, drill.xml (JUnit), and what was "
-            f"flown; by default {_OUT}, or {_OUT}-mavlink or {_OUT}-px4."
+            help=f"Folder for drill.json, drill.csv, README.md, drill.xml (JUnit) and flights; by "
+            f"default {_OUT}, or {_OUT}-mavlink or {_OUT}-px4."
         ),
     ] = None
 
@@ -84,7 +82,7 @@ class DrillOptions:
 @app.command()
 @options_of(DrillOptions)
 def drill(options: DrillOptions) -> None:
-    """Inject faults into a fleet in flight, and judge by the truth whether promises held."""
+    """Inject faults into a flying fleet, and check promises against the true tracks."""
     from lpac.study.drills import Drill, faults_of
 
     names, vehicle = tuple(options.faults or ()), options.vehicle
@@ -112,19 +110,19 @@ def fly_faults(
     as_json: bool,
     again: bool = False,
 ) -> None:
-    """Fly a drill, write its report and print it; a single flight `again` leaves its logs, too."""
+    """Fly a drill, write its report and print it; with `again` one flight, which keeps its logs."""
     from lpac.study.drills import fly_drill, logs_of, outcomes_of
 
     require_here(VehicleKind(drill.engine), ray)
     folder, in_real_time = out or _OUT, drill.engine != "simulated"
     if in_real_time:
         folder = out or Path(f"{_OUT}-{drill.engine}")
-        # Whoever ends this command ends its programs, too.
+        # SIGTERM must end the robots' programs as Ctrl-C does.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     flights, cores = drill.flights(px4), pool(ray)
     if again:
         outcomes = dict(outcomes_of((flights[0],), folder))
-        # Beside what it leaves, and not in place of a campaign's.
+        # Beside its logs, since a campaign's report must not be overwritten.
         folder = logs_of(flights[0], folder)
     else:
         with folder_lock("the drill", folder), telling("flights") as tell:
@@ -138,7 +136,7 @@ def fly_faults(
 
 
 def _tell(outcomes: "Outcomes", folder: Path, *, as_json: bool) -> None:
-    """Write the report, and JUnit's XML, and print it."""
+    """Write the report and JUnit's XML, and print the report."""
     from lpac.study.drill_report import as_junit, report_of
     from lpac.study.provenance import made_by
 

@@ -1,4 +1,4 @@
-"""`lpac evaluate`: policies and baselines over many worlds, and how surely one is better."""
+"""`lpac evaluate`: compare policies and baselines over many worlds."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -34,7 +34,7 @@ _OUT = Path("out/evaluate")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluateOptions:
-    """Options of the study that is flown."""
+    """Options of the study."""
 
     methods: Annotated[
         list[str] | None,
@@ -81,7 +81,7 @@ class EvaluateOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConditionOptions:
-    """Options of further conditions, each flown beside the usual one."""
+    """Options of further conditions, each in addition to the usual one."""
 
     duration: Annotated[float, "Flight time, s."] = 60.0
     losses: Annotated[
@@ -92,8 +92,7 @@ class ConditionOptions:
         list[Transport] | None,
         typer.Option(
             "--transport",
-            help="Also with the radio that such a team would have, by a model of one Wi-Fi "
-            "channel.",
+            help="Also with such a team's radio, by a model of one Wi-Fi channel.",
         ),
     ] = None
     wifi: WifiFile = None
@@ -113,28 +112,28 @@ class ConditionOptions:
         list[float] | None,
         typer.Option(
             "--position-error",
-            help="Also with robots that are wrong about where they are: standard deviation, m.",
+            help="Also with errors of the estimated positions: standard deviation, m.",
         ),
     ] = None
     payloads: Annotated[
         list[str] | None,
         typer.Option(
             "--payload", metavar="TYPE",
-            help="Also with messages that carry float32 or int8 instead of float16; each --loss "
-            "and --transport is then flown with them, too.",
+            help="Also with messages in float32 or int8 instead of float16, and each --loss and "
+            "--transport with these.",
         ),
     ] = None  # fmt: skip
     vehicle: Annotated[
         VehicleKind,
-        "Also as the field is flown: whole robots, at most 30, as `lpac sim` has them, and points "
-        "from the same pads.",
+        "Also as in the field: at most 30 whole robots, as in `lpac sim`, and points from the "
+        "same pads.",
     ] = VehicleKind.POINT
 
 
 @app.command()
 @options_of(EvaluateOptions, ConditionOptions)
 def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
-    """Policies and baselines over many worlds: how well they cover, with confidence intervals."""
+    """Compare policies and baselines over many worlds, with confidence intervals."""
     given = options.methods or [str(DEFAULT_BUNDLE)]
     for path in (part for text in given for part in text.split(",") if "/" in part):
         found(Path(path))
@@ -168,7 +167,7 @@ def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
 
 
 def _check(options: EvaluateOptions, hard: ConditionOptions, given: Sequence[str]) -> None:
-    """Raise ValueError for what cannot be evaluated."""
+    """Raise ValueError for impossible options."""
     from edge.core.wire import PAYLOAD_TYPES
     from lpac.study.study import BASELINES
     from lpac.study.worlds import SET_UPS, WORLD_SETS
@@ -195,7 +194,7 @@ def _check(options: EvaluateOptions, hard: ConditionOptions, given: Sequence[str
 
 
 def _methods(given: Sequence[str], baselines: Sequence[str] | None) -> "tuple[Method, ...]":
-    """Those that are given, and behind them the baselines. Raises BundleError."""
+    """The given methods, then the baselines. Raises BundleError."""
     from lpac.study.study import BASELINES, Method
 
     methods = [
@@ -208,7 +207,7 @@ def _methods(given: Sequence[str], baselines: Sequence[str] | None) -> "tuple[Me
 
 
 def _changes(hard: ConditionOptions, calibrated: "Calibration") -> list[dict[str, Any]]:
-    """The keys of each condition, as a study has them; the first is as usual."""
+    """Keys of each condition, as in a study's file; the first is the usual condition."""
     from edge.core.wire import PAYLOAD_TYPES
 
     wifi = asdict(calibrated.wifi)
@@ -233,7 +232,7 @@ def _changes(hard: ConditionOptions, calibrated: "Calibration") -> list[dict[str
 
 
 def _names(given: Sequence[str]) -> list[str]:
-    """Short ones: of each path the last parts, as many as tell it from the others."""
+    """Short names: the fewest last parts of each path that tell it from the others."""
     parts = [[Path(path).resolve().parts for path in text.split(",")] for text in given]
     for depth in range(1, max(len(part) for text in parts for part in text) + 1):
         names = [",".join("/".join(part[-depth:]) for part in text) for text in parts]

@@ -1,4 +1,4 @@
-"""`lpac export`: a trained torch checkpoint becomes a bundle."""
+"""`lpac export`: a bundle from a trained torch checkpoint."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`lpac ground`: the process that speaks to the fleet."""
+"""`lpac ground`: the ground station's process."""
 
 import asyncio
 import contextlib
@@ -32,9 +32,9 @@ def ground(
         typer.Option("--name", help="This station's name; by default its member's, or user@host."),
     ] = "",
 ) -> None:
-    """Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.
+    """Run the ground station until Ctrl-C; `lpac mission`, `watch` and others need it.
 
-    It sets nothing in motion by itself. Started again, it continues where the last one stopped.
+    It commands nothing on its own. Started again, it continues where the last one stopped.
     """
     from edge.core.counted import counted
     from lpac.ground.station.config import load_ground
@@ -43,7 +43,7 @@ def ground(
     if not name.isprintable() or len(name) > _LONGEST_NAME:
         raise ValueError(f"--name {name!r}: must be at most {_LONGEST_NAME} printable characters")
     config = load_ground(fleet, name or None, default_name=user_at_host)
-    # Nothing that a robot says can be a text that cannot be printed.
+    # Texts of robots may have characters that this terminal cannot encode.
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     process = GroundProcess(config, _print_event)
     started = (
@@ -75,7 +75,7 @@ async def _run(
         )
 
     def hang_up() -> None:
-        # Its terminal was closed: it cannot ask, so it ends when nobody is in the air.
+        # Without its terminal it cannot ask, so it ends once no robot is in the air.
         if process.needed():
             loop.call_later(_LOOK_AGAIN_S, hang_up)
         else:
@@ -93,5 +93,5 @@ def _print_event(event: "GroundEvent") -> None:
     clock = time.strftime("%H:%M:%S", time.localtime(event.unix_time_s))
     by = f"{event.operator}: " if event.operator and event.kind == "command" else ""
     robot = f"{event.robot}: " if event.robot else ""
-    with contextlib.suppress(OSError):  # Nobody reads it: no reason to leave the fleet alone.
+    with contextlib.suppress(OSError):  # A closed pipe must not end the station.
         typer.echo(f"{clock}  {robot}{by}{event.text}")

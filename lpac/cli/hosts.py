@@ -1,4 +1,4 @@
-"""`lpac hosts`: robot computers on this machine, to try `lpac fleet` on."""
+"""`lpac hosts`: simulated robot computers on this machine, to try `lpac fleet`."""
 
 import os
 import signal
@@ -19,9 +19,9 @@ _FORGET_EVERY_S = 60.0
 @app.command()
 def hosts(
     *,
-    count: Annotated[int, typer.Option("--hosts", "-n", help="How many, spares and all.")] = 3,
-    spares: Annotated[int, typer.Option(help="How many of them have no slot.")] = 0,
-    image: Annotated[Path, typer.Option(help="What `make image ARCH=amd64` made.")] = Path(
+    count: Annotated[int, typer.Option("--hosts", "-n", help="Computers, with spares.")] = 3,
+    spares: Annotated[int, typer.Option(help="Number of them without a slot.")] = 0,
+    image: Annotated[Path, typer.Option(help="Image from `make image ARCH=amd64`.")] = Path(
         "out/image/amd64"
     ),
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
@@ -33,7 +33,7 @@ def hosts(
     from lpac.sim.hosts.hosts import SimulatedHosts
 
     def end(*_: object) -> None:
-        # Once: leaving must not be broken off, or hosts would stay.
+        # Ignore further signals, or an interrupted cleanup would leave hosts behind.
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
@@ -59,7 +59,7 @@ def hosts(
 
 
 def _give_to_user(folder: Path) -> None:
-    """With sudo: SSH refuses keys of others."""
+    """Under sudo, give the files to the user: SSH refuses keys of other owners."""
     user, group = os.environ.get("SUDO_UID"), os.environ.get("SUDO_GID")
     if user and group:
         for path in (folder, *folder.iterdir()):

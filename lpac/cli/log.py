@@ -1,4 +1,4 @@
-"""`lpac log`: what the robots' and the ground's logs hold."""
+"""`lpac log`: trials in logs, and repair of damaged logs."""
 
 import json
 from pathlib import Path
@@ -8,9 +8,9 @@ import typer
 
 from lpac.cli.apps import AsJson, new_app
 
-app = new_app("log", "What the robots' and the ground's logs hold.")
+app = new_app("log", "List the trials in logs, and repair damaged logs.")
 
-# By name and boot nonce of the program, and trial.
+# Keys: program's name, its boot nonce, trial.
 _Uptimes = dict[tuple[str, str, str], tuple[float, float]]
 
 
@@ -19,7 +19,7 @@ def trials(
     folder: Annotated[Path, typer.Argument(help="Folder of logs (*.mcap).")],
     as_json: AsJson = False,
 ) -> None:
-    """Say which trials were flown, and when.
+    """List the trials, and when they were flown.
 
     In JSON: file -> trial -> [first, last] Unix time, s; the time without a trial is under "".
     """
@@ -31,7 +31,7 @@ def trials(
         try:
             uptimes[path] = _uptimes(path, began_s)
         except FlightLogError as error:
-            # Perhaps the power went before the first byte of it was on the disk.
+            # Power may have failed before the first byte was on the disk.
             _say(f"{error}: left out")
     found: dict[str, dict[str, tuple[float, float]]] = {}
     for path, times in uptimes.items():
@@ -51,8 +51,8 @@ def trials(
 def _uptimes(path: Path, began_s: dict[tuple[str, str], float]) -> _Uptimes:
     """First and last uptime of each program and trial in a file, s. Raises FlightLogError.
 
-    Robots' clocks may be set meanwhile; uptime never goes back. `began_s` gets when each program
-    began, by its clock as it was at last.
+    Uptime never jumps, unlike the robots' clocks. `began_s` gets each program's start by the last
+    state of its clock.
     """
     from edge.drivers.flight_log import read
 
@@ -61,7 +61,7 @@ def _uptimes(path: Path, began_s: dict[tuple[str, str], float]) -> _Uptimes:
         uptime_s = status.get("uptime_s")
         program = (path.stem.rpartition("-")[0], str(status.get("boot_nonce")))
         if not (isinstance(uptime_s, float | int) and 0.0 <= uptime_s <= time_s):
-            # What tells none goes by its clock alone.
+            # Without a valid uptime, only the clock is left.
             program, uptime_s = (program[0], ""), time_s
         began_s[program] = time_s - uptime_s
         key = (*program, str(status.get("trial", "")))
@@ -73,9 +73,9 @@ def _uptimes(path: Path, began_s: dict[tuple[str, str], float]) -> _Uptimes:
 @app.command()
 def repair(
     log: Annotated[Path, typer.Argument(help="A damaged log (*.mcap).")],
-    out: Annotated[Path, typer.Argument(help="The file to write, which is not there yet.")],
+    out: Annotated[Path, typer.Argument(help="The new file to write.")],
 ) -> None:
-    """Write what is whole of a damaged log, and say what is missing."""
+    """Copy the readable parts of a damaged log, and list the gaps."""
     from edge.drivers.flight_log import repair
 
     count = repair(log, out, _say)

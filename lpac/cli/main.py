@@ -1,4 +1,4 @@
-"""The `lpac` command: `lpac NAME` is in `lpac.cli.NAME`, and is loaded when it is called."""
+"""The `lpac` command. `lpac NAME` is in `lpac.cli.NAME`, which is imported on use."""
 
 import importlib
 import os
@@ -7,49 +7,43 @@ from importlib.util import find_spec
 from typing import Annotated, Any
 
 # One process is one robot, or a simulation on one core: BLAS threads would only disturb the loops.
-# numpy reads this when it is first imported, and no command has imported it yet.
+# numpy reads this on import, and no command has imported it yet.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
 from lpac.cli.apps import CommandList
 
-# Each command, and what its own help begins with; a test compares them.
+# First sentence of each command's help, known without importing it; a test compares them.
 _COMMANDS = {
-    "demo": "Ten robots over an unknown world for 60 s, beside the baselines; makes a figure.",
+    "demo": "Fly ten robots and the baselines over an unknown world for 60 s, and draw a figure.",
     "sim": "Fly a swarm over an unknown world and print how well it covers it.",
-    "evaluate": (
-        "Policies and baselines over many worlds: how well they cover, with confidence intervals."
-    ),
-    "study": (
-        "Fly an experiment of yours, from a TOML file: policies over worlds, or faults in flight."
-    ),
+    "evaluate": "Compare policies and baselines over many worlds, with confidence intervals.",
+    "study": "Fly your own experiment from a TOML file: policies over worlds, or faults in flight.",
     "train": (
         "Train a policy, or continue where a training stopped, keeping the weights that fly best."
     ),
-    "ablate": "Train a method without each of its parts, and say what each of them is worth.",
-    "paper": "Repeat the paper's experiments, and run some that its arguments call for.",
-    "drill": "Inject faults into a fleet in flight, and judge by the truth whether promises held.",
+    "ablate": "Train a method without each of its parts, and measure what each contributes.",
+    "paper": "Repeat the paper's experiments, and run others that its arguments call for.",
+    "drill": "Inject faults into a flying fleet, and check promises against the true tracks.",
     "hosts": "Simulate robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C.",
-    "ground": "Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.",
+    "ground": "Run the ground station until Ctrl-C; `lpac mission`, `watch` and others need it.",
     "mission": "Command the fleet, through `lpac ground`.",
     "watch": "Show fleet and mission, alarms first; h holds all robots, l lands them, ? helps.",
     "map": "Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.",
     "foxglove": "Show the fleet in Foxglove, live or from logs; or write its layout.",
     "site": "Places to fly at: origin, fence, pads and landing points, beside fleet.toml.",
-    "record": "Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs.",
-    "report": "Make figures and an HTML page from flight logs; and how well missions repeat.",
-    "replay": "Run policy and flight decisions again on flight logs; say what differs.",
+    "record": "Log statuses, commands and costs from `lpac ground`, until Ctrl-C.",
+    "report": "Make figures and an HTML page from flight logs, and show how well missions repeat.",
+    "replay": "Recompute policy and flight decisions from flight logs, and print differences.",
     "fleet": "Deploy to the robots, start and stop them.",
     "export": "Export a trained torch checkpoint as a bundle that runs without torch.",
-    "bundle": "Look at a policy bundle; verify or time it on this machine.",
+    "bundle": "Show, verify or time a policy bundle on this machine.",
     "robot": "Fly one robot, or check whether it could.",
-    "bench": (
-        "Measure this machine's network: what the programs send, and what bandwidth they leave."
-    ),
-    "log": "What the robots' and the ground's logs hold.",
+    "bench": "Measure the bandwidth that the robots' programs leave on this machine's network.",
+    "log": "List the trials in logs, and repair damaged logs.",
 }
-# The extra that has a command's packages; without one they are in every install.
+# The extra with a command's packages; other commands work in every install.
 _EXTRAS = {
     "sim": ("demo", "sim", "evaluate", "study", "paper", "drill", "hosts"),
     "ground": ("ground", "mission", "watch", "map", "site", "record", "report"),
@@ -60,16 +54,16 @@ _EXTRAS = {
     "bench": ("bench",),
 }
 _INTERRUPTED = 130
-# What these have done is on the disk.
+# These store finished work, and continue when repeated.
 _GO_ON = ("train", "ablate", "evaluate", "study", "drill")
 
 
 class _Lpac(CommandList):
-    """Knows its commands without loading them. A robot has, and lists, few of them."""
+    """All commands, each imported on use. A robot's install has, and lists, few of them."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        # Who mistypes one is told the nearest of these names.
+        # click suggests the nearest of these names for a mistyped one.
         names: dict[str, Any] = dict.fromkeys(_COMMANDS)
         self.commands = names
 
@@ -85,12 +79,12 @@ class _Lpac(CommandList):
         return _COMMANDS[name]
 
     def invoke(self, ctx: Any) -> Any:
-        """Ctrl-C, where a command has nothing to say about it; and what is not installed."""
+        """Invoke a command, and handle Ctrl-C and missing packages in one line each."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            # `python -m` dies of the signal, whatever is caught, if it came while a string was
-            # executed, as named tuples do when they are imported. The next string forgets that.
+            # Python remembers an interrupt inside exec(), which namedtuple calls on import, and
+            # `python -m` then dies of the signal even if it is caught. The next exec() resets it.
             exec("")
             then = ": the same command goes on" if ctx.invoked_subcommand in _GO_ON else ""
             typer.echo(f"lpac: interrupted{then}", err=True)
@@ -100,7 +94,7 @@ class _Lpac(CommandList):
 
 
 def _what_is_missing(error: ModuleNotFoundError, command: str | None) -> str:
-    """One line. Raises the error if no install of ours would help."""
+    """One line with the remedy. Raises the error if none of our extras would help."""
     package = (error.name or "").split(".")[0]
     if package in ("lpac", "export"):
         return f"lpac: {error.name} is not installed here: this command is the workstation's"
@@ -116,7 +110,7 @@ app = typer.Typer(
     name="lpac",
     cls=_Lpac,
     no_args_is_help=True,
-    # A shell with people at it is a workstation's.
+    # Shell completion is for workstations only.
     add_completion=find_spec("lpac.sim") is not None,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -144,7 +138,7 @@ def _lpac(
 
 
 def main() -> None:
-    """Run `lpac`; a person's mistake ends in one line and a non-zero exit code."""
+    """Run `lpac`; a user's mistake ends in one line and a non-zero exit code."""
     try:
         app()
     except OSError as error:
@@ -154,7 +148,7 @@ def main() -> None:
 
 
 def _in_words(error: OSError) -> str:
-    """The file and its fault; the error as it is, if it is no file's, or a person wrote it."""
+    """The file and its fault; errors without a file, or with our own text, are unchanged."""
     from edge.core.file_errors import in_words, is_known
 
     if error.filename is None or not is_known(error):

@@ -1,4 +1,4 @@
-"""`lpac map`: the live map, a page for the browser of the laptop."""
+"""`lpac map`: the live map, a page for the browser."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -53,7 +53,7 @@ def live_map(page: MapOptions) -> None:
 
     require_host("--host", page.host)
     config = load_fleet(page.fleet)
-    # With "::" asyncio would serve IPv6 alone, of which a field's network has no address to open.
+    # With "::" asyncio serves IPv6 alone, and a field's network has no IPv6 addresses.
     host = "0.0.0.0" if page.host == "::" else page.host
     access = _access(host, page)
     tls = _tls(config, host) if page.over_tls else None
@@ -64,7 +64,7 @@ def live_map(page: MapOptions) -> None:
 
 
 def _access(host: str, page: MapOptions) -> "Access":
-    """Raises ValueError."""
+    """Who may open the page. Raises ValueError for an invalid --token."""
     import re
     import secrets
 
@@ -80,7 +80,7 @@ def _access(host: str, page: MapOptions) -> "Access":
 
 
 def _tls(config: "FleetConfig", host: str) -> "ssl.SSLContext":
-    """With a certificate by the fleet's authority. Raises AuthorityError."""
+    """TLS with a certificate of the fleet's authority. Raises AuthorityError."""
     import datetime
     import ssl
 

@@ -27,10 +27,12 @@ from lpac.cli.study import StudyTask, fly_study, fly_together, show_report
 if TYPE_CHECKING:
     from lpac.analysis.flight import FlightRecord
 
-app = new_app("paper", "Repeat the paper's experiments, and run some that its arguments call for.")
+app = new_app(
+    "paper", "Repeat the paper's experiments, and run others that its arguments call for."
+)
 
 _OUT = Path("out/paper")
-# By this `lpac paper all` knows what it made itself, and need not make again.
+# Marks results of `lpac paper all`, which it reuses.
 _MADE_FOR_ALL = "made_by.json"
 _IN_THE_AIR = ("e1", "e2", "e3", "transfer", "async")
 # Robots, repetitions, s.
@@ -50,17 +52,17 @@ _Namespaces = Annotated[
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExperimentOptions:
-    """Options of each experiment: what flies, or which logs tell of it."""
+    """Options of each experiment: what flies, or logs of a flight."""
 
     bundles: Annotated[
         list[Path] | None,
         typer.Option(
             "--bundle",
-            help="Policy bundle, the shipped one if not given; with --logs the one that flew, "
-            "which says what baselines see and how far robots hear. Of `transfer` several.",
+            help="Policy bundle, the shipped one if not given; with --logs the flown one, which "
+            "defines the baselines' sensors and radio range. `transfer` takes several.",
         ),
     ] = None
-    vehicle: Annotated[VehicleKind, "Points, or whole robots, as `lpac sim` has them."] = (
+    vehicle: Annotated[VehicleKind, "Points, or whole robots, as in `lpac sim`."] = (
         VehicleKind.POINT
     )
     px4: Px4 = None
@@ -84,17 +86,17 @@ class ExperimentOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Changes:
-    """Changes of an experiment; it stays as it is where an option is None."""
+    """Changes of an experiment; options that are None change nothing."""
 
     worlds: Annotated[
         int | None,
         typer.Option(
             "--worlds", "-k",
-            help="How many of the validation set, from the first on; else as the study has it, "
-            "and a fifth of it, or one in real time, for whole robots in `async` and `transfer`.",
+            help="Number of worlds of the validation set, from the first on; else the study's, and "
+            "a fifth of it, or one in real time, for whole robots in `async` and `transfer`.",
         ),
     ] = None  # fmt: skip
-    trials: Annotated[int | None, "How many trials; else 3."] = None
+    trials: Annotated[int | None, "Number of trials; else 3."] = None
     world: Annotated[int | None, "Number of the world, of the validation set; else 0."] = None
     set_ups: Annotated[
         list[str] | None,
@@ -106,7 +108,7 @@ class Changes:
 
 
 def _add(name: str, about: str, *changes: str) -> Callable[..., None]:
-    """Add the command of an experiment, with these fields of `Changes` as options."""
+    """Add an experiment's command, with these fields of `Changes` as options."""
 
     @options_of(ExperimentOptions, chosen(Changes, *changes))
     def command(options: ExperimentOptions, given: Any) -> None:
@@ -119,14 +121,13 @@ def _add(name: str, about: str, *changes: str) -> Callable[..., None]:
 
 e1 = _add("e1", "Transferability: unseen worlds from the same starts, beside baselines.", "worlds")
 e2 = _add(
-    "e2", "Repeatability: one world again and again, starts and GPS a little off.",
+    "e2", "Repeatability: trials in one world with small errors of starts and GPS.",
     "trials", "world",
 )  # fmt: skip
-e3 = _add("e3", "Perturbation: robots are taken away at steady state, and brought back.", "world")
+e3 = _add("e3", "Perturbation: robots are removed at steady state, and brought back.", "world")
 asynchrony = _add(
-    "async", "Rates of perception and of messages, in step or not, and late messages: what they "
-    "cost.", "worlds", "quick",
-)  # fmt: skip
+    "async", "The cost of slow and unsynchronised loops, and of late messages.", "worlds", "quick"
+)
 transfer = _add(
     "transfer", "Other numbers of robots, features and ranges: `lpac evaluate` in the paper's "
     "set-ups.", "worlds", "set_ups", "quick",
@@ -134,7 +135,7 @@ transfer = _add(
 
 
 def _experiment(name: str, options: ExperimentOptions, changes: Changes) -> None:
-    """Fly it, or read it from logs."""
+    """Fly the experiment, or evaluate logs of it."""
     _check(name, options, changes)
     if options.logs is not None:
         _from_logs(name, options.logs, options)
@@ -145,7 +146,7 @@ def _experiment(name: str, options: ExperimentOptions, changes: Changes) -> None
 
 
 def _task(name: str, options: ExperimentOptions, changes: Changes) -> StudyTask:
-    """The changed experiment; and the command that repeats it."""
+    """The experiment with its changes, and the command that repeats it."""
     from lpac.paper.experiments import experiment
 
     bundles, vehicle = options.bundles or [DEFAULT_BUNDLE], options.vehicle
@@ -169,7 +170,7 @@ def _task(name: str, options: ExperimentOptions, changes: Changes) -> StudyTask:
 
 
 def _check(name: str, options: ExperimentOptions, changes: Changes) -> None:
-    """Raise ValueError for an option that would do nothing, or is impossible."""
+    """Raise ValueError for an option without effect, or an impossible one."""
     if changes.trials is not None and changes.trials < 2:
         raise ValueError(f"--trials {changes.trials}: must be at least 2")
     for path in options.bundles or ():
@@ -195,7 +196,7 @@ def _check(name: str, options: ExperimentOptions, changes: Changes) -> None:
 
 
 def _from_logs(name: str, logs: Path, options: ExperimentOptions) -> None:
-    """The same of the missions in logs."""
+    """Make an experiment's report from the missions in logs."""
     from lpac.paper.logged import REPORTS, LoggedMissions, ids_in
     from lpac.study.provenance import made_by
 
@@ -219,7 +220,7 @@ def _from_logs(name: str, logs: Path, options: ExperimentOptions) -> None:
 def _missions(
     logs: Path, options: ExperimentOptions, bundle: Path | None
 ) -> "dict[str, FlightRecord]":
-    """The missions in the logs below a folder, by name. Raises ValueError if one has no cost."""
+    """Missions in the logs below a folder, by name. Raises ValueError if one has no cost."""
     from lpac.analysis.examination import Wanted, examine
 
     wanted = Wanted(
@@ -248,7 +249,7 @@ def network(
     as_json: AsJson = False,
     out: _Out = None,
 ) -> None:
-    """Table I, and throughput by number of robots: `lpac bench network` with what is installed."""
+    """Table I, and throughput over robots: `lpac bench network` with all installed middlewares."""
     from lpac.cli.bench import network as measure
     from lpac.middleware.kinds import MIDDLEWARES
     from lpac.paper.network import network_report
@@ -285,10 +286,10 @@ def everything(
     ray: Ray = None,
     out: _Out = None,
 ) -> None:
-    """All of them, and one page: each claim of the paper beside the result here.
+    """Run all experiments, and write a page with each claim of the paper beside our result.
 
-    Whole robots fly e1, e2 and e3, or points with --quick. Results that were made with the same
-    bundle and code are reused.
+    Whole robots fly e1, e2 and e3, or points with --quick. Results of the same bundle and code are
+    reused.
     """
     from edge.policy.bundle import load_bundle
     from lpac.cli.bench import require_namespaces
@@ -296,7 +297,7 @@ def everything(
     from lpac.study.provenance import made_by
 
     folder, loaded = out or _OUT, load_bundle(bundle)
-    # Known before hours of flights.
+    # Fail before hours of flights.
     require_namespaces(namespaces, _QUICK_NETWORK[0] if quick else None)
     tasks = [_task_of_all(name, bundle, folder, quick=quick) for name in _IN_THE_AIR]
     told = {task.name: made_by(task.command, [loaded.id]) for task in tasks}
@@ -327,7 +328,7 @@ def _task_of_all(name: str, bundle: Path, folder: Path, *, quick: bool) -> Study
 
 
 def _is_made(folder: Path, made_by: Mapping[str, str]) -> bool:
-    """Whether what is there was made so; else it is made again."""
+    """Whether the folder has results that were made in this way."""
     kept = folder / _MADE_FOR_ALL
     return kept.exists() and json.loads(kept.read_text()) == made_by
 

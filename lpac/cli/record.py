@@ -1,4 +1,4 @@
-"""`lpac record`: a log of what the ground tells."""
+"""`lpac record`: a log of the ground's statuses, commands and costs."""
 
 import contextlib
 import sys
@@ -20,7 +20,7 @@ def record(
         Path | None, typer.Option(help="Folder; else `logs` beside the fleet's description.")
     ] = None,
 ) -> None:
-    """Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs."""
+    """Log statuses, commands and costs from `lpac ground`, until Ctrl-C."""
     from lpac.fleet.settings import load_fleet
     from lpac.ground.record import record as record_to
 
@@ -33,5 +33,5 @@ def record(
 
 
 def _say(text: str) -> None:
-    with contextlib.suppress(OSError):  # Nobody reads it: no reason to record no more.
+    with contextlib.suppress(OSError):  # A closed pipe must not end the recording.
         typer.echo(text)

@@ -1,4 +1,4 @@
-"""`lpac replay`: run again what a flight log holds."""
+"""`lpac replay`: recompute a flight's decisions from its log."""
 
 import json
 import math
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 app = new_app()
 
-# Of each log; `--json` has all.
+# Per log; `--json` has all.
 _MOST_ROWS = 20
 _ROUNDS = "another kind of processor rounds otherwise in the last digits, the same one does not"
 
 
 class _RunAgain(NamedTuple):
-    """Result of the run: of the policy, if it ran, and of the flight by segment of the logs."""
+    """Result: the policy, if it ran, and the flight decisions by segment of the logs."""
 
     metadata: "Mapping[Path, FlightMetadata]"
     bundle: "Bundle | None"
@@ -49,7 +49,7 @@ def replay(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Run policy and flight decisions again on flight logs; say what differs."""
+    """Recompute policy and flight decisions from flight logs, and print differences."""
     with working("running the logs again"):
         of = _run_again(logs, bundle)
     for gap in of.missing:
@@ -85,7 +85,7 @@ def _run_again(logs: list[Path], bundle: Path | None) -> _RunAgain:
 
 
 def _print_well(of: _RunAgain) -> None:
-    """Print that nothing differs."""
+    """Print the result of a run without differences."""
     if of.bundle is not None:
         found = "computes what it computed in flight"
         if not of.comparisons:
@@ -98,7 +98,7 @@ def _print_well(of: _RunAgain) -> None:
 
 
 def _problems(of: _RunAgain) -> list[str]:
-    """Why it is not said that all is as it was in flight."""
+    """Differences from the flight, and damaged logs."""
     problems = []
     differing = [c for c in of.comparisons if c.differing]
     if differing:
@@ -117,7 +117,7 @@ def _problems(of: _RunAgain) -> list[str]:
 
 
 def _metadata(logs: Iterable[Path]) -> "dict[Path, FlightMetadata]":
-    """By segment. Of a folder, what no robot wrote is left out."""
+    """Metadata by segment. In a folder, files that are no flight logs are skipped."""
     from edge.drivers.flight_log import FlightLogError, read_metadata
 
     metadata = {}
@@ -127,7 +127,7 @@ def _metadata(logs: Iterable[Path]) -> "dict[Path, FlightMetadata]":
         except FlightLogError as error:
             if path in logs:
                 raise
-            # Perhaps the power went before the first byte of it was on the disk.
+            # Power may have failed before the first byte was on the disk.
             typer.echo(f"lpac: {error}: left out", err=True)
     return metadata
 
@@ -135,7 +135,7 @@ def _metadata(logs: Iterable[Path]) -> "dict[Path, FlightMetadata]":
 def _policy(
     metadata: "Mapping[Path, FlightMetadata]", given: Path | None
 ) -> "tuple[Bundle, tuple[Comparison, ...]]":
-    """The bundle, and what it computes now of all its ticks."""
+    """The bundle, and comparisons of all its ticks with the log."""
     from itertools import chain
 
     from edge.drivers.flight_log import read
@@ -157,7 +157,7 @@ def _policy(
                 f"and {bundle_path} is {bundle.id[:12]}"
             )
     if bundle.manifest.family != "lpac":
-        # What such an agent remembers from step to step is not in the log.
+        # The internal state of other families is not in the log.
         return bundle, ()
     messages = chain.from_iterable(
         read(path, "perception", "policy", missing=_told_already) for path in metadata
@@ -172,13 +172,13 @@ def _has_policy_ticks(paths: Iterable[Path]) -> bool:
 
 
 def _told_already(_: "Missing") -> None:
-    """By `_flights`, which reads all of them."""
+    """Ignore a gap: `_flights`, which reads all logs, reports it."""
 
 
 def _flights(
     metadata: "Mapping[Path, FlightMetadata]", missing: "list[Missing]"
 ) -> "dict[Path, FlightReplay]":
-    """Decide the programs' flights again, by their logs. A program's segments are in order."""
+    """Recompute the programs' flight decisions. A program's segments must be in order."""
     from edge.drivers.flight_log import read
     from edge.flight.record import TickError, TickReader
     from edge.flight.replay import FlightReplay

@@ -1,4 +1,4 @@
-"""`lpac report`: figures, a page and numbers of logged flights."""
+"""`lpac report`: figures, a page and numbers from flight logs."""
 
 import json
 import math
@@ -44,7 +44,7 @@ class ReportOptions:
 @app.command()
 @options_of(ReportOptions)
 def report(of: ReportOptions) -> None:
-    """Make figures and an HTML page from flight logs; and how well missions repeat."""
+    """Make figures and an HTML page from flight logs, and show how well missions repeat."""
     from lpac.analysis.examination import Wanted, examine
 
     times_s = _times_s(of.times)
@@ -57,7 +57,7 @@ def report(of: ReportOptions) -> None:
             show(share, what, ())
 
         examined = examine(of.folders, wanted, tell)
-        # Only once there is something to draw: what draws takes a second to load.
+        # Imported only when needed: matplotlib takes a second.
         from lpac.analysis.write_report import write
 
         page = write(examined, of.out or of.folders[0] / "report", times_s, tell)
@@ -81,7 +81,7 @@ def _times_s(times: str | None) -> tuple[float, ...]:
 
 
 def _line(record: "FlightRecord") -> str:
-    """A mission in one line."""
+    """One line about a mission."""
     from edge.core.counted import counted
 
     words = [

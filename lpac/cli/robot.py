@@ -1,4 +1,4 @@
-"""`lpac robot`: fly one robot, or check whether it could fly."""
+"""`lpac robot`: fly, check or set up one robot."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ _END_WITHIN_S = 2.9
 
 
 class Rc(StrEnum):
-    """Remote control that can take the vehicle."""
+    """Remote control that can take over the vehicle."""
 
     PILOT = "pilot"
     NONE = "none"
@@ -37,10 +37,10 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
 
     A vehicle that is flying then holds, or lands if the configuration says so.
     """
-    # There is nothing to leave in order while all this is loaded.
+    # While modules are imported there is nothing to clean up.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: os._exit(0))
-    # A terminal that the Wi-Fi takes away must not end a flight; the ground does that.
+    # A terminal lost with the Wi-Fi must not end a flight.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
     from edge.drivers.stop import Stop
@@ -52,7 +52,7 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
 
     def on_signal(*_: object) -> None:
         if not stop.is_set():
-            # Whatever hangs, the program ends; PX4 then lands a vehicle that it was flying.
+            # The program ends even if it hangs; PX4 then lands a vehicle that it was flying.
             signal.setitimer(signal.ITIMER_REAL, _END_WITHIN_S)
             stop.set()
 
@@ -67,7 +67,7 @@ def check(
     wait: Annotated[float, typer.Option(help="How long the robot may take to be ready, s.")] = 15.0,
     as_json: AsJson = False,
 ) -> None:
-    """Say which PX4 it is, what it would do when something fails, and what keeps it from flying.
+    """Print PX4's version, its reactions to failures, and what prevents a flight.
 
     With parameters = "set" in the configuration, unsafe PX4 parameters are set.
     """
@@ -101,7 +101,7 @@ def setup(
     rc: Annotated[Rc, typer.Option(help="Whether somebody holds a remote control.")],
     ceiling: Annotated[float, typer.Option(help="The fence's, above the pad, m.")],
     url: Annotated[
-        str, typer.Option(help="Where PX4's MAVLink comes in.")
+        str, typer.Option(help="Where PX4's MAVLink arrives.")
     ] = "udpin://127.0.0.1:14551",
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Another address than 127.0.0.1, which others reach.")
@@ -112,9 +112,9 @@ def setup(
     wait: Annotated[float, typer.Option(help="How long to listen for the vehicle, s.")] = 10.0,
     as_json: AsJson = False,
 ) -> None:
-    """Set a vehicle's system id and failsafe parameters, once, also those that need a reboot.
+    """Set a vehicle's system id and failsafe parameters once, also those that need a reboot.
 
-    It must be the only vehicle there, and disarmed. No configuration is needed.
+    It must be the only vehicle at the URL, and disarmed. No configuration is needed.
     """
     from edge.core.logger import show
     from edge.drivers.px4.autopilot import MavsdkAutopilot
@@ -132,7 +132,7 @@ def setup(
 
 
 def _tell_setup(report: "SetupReport", *, as_json: bool) -> None:
-    """Raises ValueError if there are problems."""
+    """Print the report. Raises ValueError if there are problems."""
     if as_json:
         typer.echo(json.dumps(report._asdict(), indent=2))
     else:

@@ -1,4 +1,4 @@
-"""`lpac study`: an experiment of one's own, as a TOML file."""
+"""`lpac study`: your own experiment from a TOML file."""
 
 import json
 import shlex
@@ -40,12 +40,12 @@ def study(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for figures, data, README.md, and what was flown; out/study and "
-            "the file's name if none."
+            help="Folder for figures, data, README.md and flights; out/study and the file's name "
+            "if none."
         ),
     ] = None,
 ) -> None:
-    """Fly an experiment of yours, from a TOML file: policies over worlds, or faults in flight."""
+    """Fly your own experiment from a TOML file: policies over worlds, or faults in flight."""
     from edge.core.toml import read_toml
     from lpac.study.file import read_study
 
@@ -64,10 +64,10 @@ def study(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyTask:
-    """A study to fly, and its report in `folder`, with `further` in the JSON.
+    """A study to fly, with its report in `folder` and `further` in the report's JSON.
 
-    The report says that the `command` made it, else the one that was typed. With `compared` the
-    first method is set against the second.
+    `command` is the command line in the report, the typed one if empty. With `compared` the report
+    compares the first method with the second.
     """
 
     name: str
@@ -88,10 +88,10 @@ def fly_study(task: StudyTask, ray: str | None, *, as_json: bool) -> None:
 
 
 def fly_together(tasks: Sequence[StudyTask], folder: Path, ray: str | None) -> "list[Report]":
-    """Fly studies, each flight once, and write their reports; `folder` keeps what was flown."""
+    """Fly studies, each flight once, and write their reports; `folder` stores the flights."""
     from lpac.study.run import run_together
 
-    # A worker process that draws nothing does not load what draws, and a mistake is told by now.
+    # Only now: mistakes are reported by then, and workers are forked without matplotlib.
     cores = pool(ray)
     folder.mkdir(parents=True, exist_ok=True)
     by_name = {task.name: task for task in tasks}
@@ -99,7 +99,7 @@ def fly_together(tasks: Sequence[StudyTask], folder: Path, ray: str | None) -> "
     flown, reports = {}, {}
     with folder_lock("the study", folder), telling("flights") as tell:
         for name, its in run_together(studies, cores, folder, tell):
-            # Drawn while the others fly.
+            # Draw while the others fly.
             flown[name], reports[name] = its, _written(by_name[name], its)
     for name, task in by_name.items():
         if "worst" in task.study.figures:
@@ -111,7 +111,7 @@ def fly_together(tasks: Sequence[StudyTask], folder: Path, ray: str | None) -> "
 
 
 def _written(task: StudyTask, flown: "Flown") -> "Report":
-    """The report, in its folder."""
+    """Write the report to its folder."""
     from lpac.study.provenance import made_by_study
     from lpac.study.summary import report_of
 
@@ -140,7 +140,7 @@ def show_report(report: "Report", folder: Path, *, as_json: bool = False) -> Non
 
 @contextmanager
 def telling(what: str) -> "Iterator[Callable[..., None]]":
-    """How far it is, as `tell(done, of)` or `tell(done, of, said)` says."""
+    """Progress on stderr, from `tell(done, of)` or `tell(done, of, said)`."""
     with progress_of(what) as progress:
         task = progress.add_task("", total=None)
 
@@ -151,7 +151,7 @@ def telling(what: str) -> "Iterator[Callable[..., None]]":
 
 
 def _opened(study: "Study") -> dict[str, Any] | None:
-    """Of the test set: by whom, when, and how many worlds of it. None if another was looked at."""
+    """Use of the test set: date, bundles and number of worlds; None for other sets."""
     if study.world_set != "test":
         return None
     return {

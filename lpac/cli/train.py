@@ -28,7 +28,7 @@ def train(
     config: Annotated[Path, typer.Argument(callback=found, help="What to train: see examples/.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for all that is made; out/train and the policy's name if none."),
+        typer.Option(help="Output folder; out/train and the policy's name if none."),
     ] = None,
     ray: Ray = None,
     as_json: AsJson = False,
@@ -60,7 +60,7 @@ def _progress() -> "Iterator[Callable[[RunProgress], None]]":
 
 
 def numbers_of_training(now: "RunProgress") -> list[str]:
-    """Words for the numbers that are known."""
+    """Text of the known numbers."""
     loss = [] if now.loss is None else [f"loss {now.loss:.3f}"]
     return loss if now.cost is None else [*loss, f"closed-loop cost {now.cost:.3f}"]
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 app = new_app()
 
-# Where there is no terminal, all columns.
+# Without a terminal, wide enough for all columns.
 _WIDE = 160
 
 
@@ -56,7 +56,7 @@ def watch(
     else:
         from lpac.ground.terminal.app import Watch
 
-        # Without the mouse the terminal's own way to mark and copy text works.
+        # With the mouse captured, the terminal could not select and copy text.
         Watch(name).run(mouse=False)
 
 
@@ -68,14 +68,14 @@ def _save_screenshot(fleet: str, path: Path, size: str) -> None:
         raise ValueError(f"--size {size}: must be columns x lines, such as 100x30")
     across, down = map(int, columns_and_lines.groups())
     with path.open("w") as file:
-        # There is a ground process, or this ends here.
+        # Raises GroundError without a ground process.
         _look(fleet)
         app = Watch(fleet, screenshot=True)
         file.write(app.run(headless=True, size=(across, down)) or "")
 
 
 def _look(fleet: str) -> tuple["FleetSetup", "FleetSnapshot"]:
-    """The fleet as it is now."""
+    """The fleet's setup and newest snapshot."""
     from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
     from lpac.ground.station.client import subscribe
 
@@ -86,4 +86,4 @@ def _look(fleet: str) -> tuple["FleetSetup", "FleetSnapshot"]:
                 setup = answer
             elif isinstance(answer, FleetSnapshot) and setup is not None:
                 return setup, answer
-    raise AssertionError("it ends by a picture or an error")
+    raise AssertionError("the subscription ends with a snapshot or an error")
