@@ -64,7 +64,7 @@ def live_map(page: MapOptions) -> None:
 
 
 def _access(host: str, page: MapOptions) -> "Access":
-    """Who may open the page. Raises ValueError for an invalid --token."""
+    """Decide access to the page. Raises ValueError for an invalid --token."""
     import re
     import secrets
 
