@@ -27,14 +27,14 @@ app = new_app(
 )
 
 _OUT = Path("out/bench/network")
-# As the paper has them: robots, repetitions, s; of the curves so many repetitions as they need.
+# Robots, repetitions, s: the paper's; for the curves, as many repetitions as they need.
 _RESTARTS = (3, 10, 60.0)
 _ROBOTS = (10, 3, 10.0)
 
 
 @app.callback()
 def bench() -> None:
-    """So that `network` is a command of its own."""
+    """Make typer keep `network` as a subcommand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +88,7 @@ class NetworkOptions:
 @app.command()
 @options_of(NetworkOptions)
 def network(of: NetworkOptions) -> None:
-    """The paper's network experiments: what a bulk stream gets beside the robots' programs."""
+    """Run the paper's network experiments: a bulk stream's throughput beside the programs."""
     from lpac.middleware.results import as_json as to_json
     from lpac.train.files import write_atomically
 
@@ -100,7 +100,7 @@ def network(of: NetworkOptions) -> None:
     with closing(_measure(plans, places)) as measured:
         for run in measured:
             runs.append(run)
-            # An interrupted measurement leaves what it has.
+            # An interrupted measurement keeps its results.
             told = json.dumps(to_json(where, runs), indent=2)
             write_atomically(of.out / "network.json", f"{told}\n".encode())
     _draw(runs, of.out)
@@ -120,7 +120,7 @@ def _experiments(given: Sequence[str] | None) -> list["Experiment"]:
 
 
 def _checked(given: Sequence[str] | None) -> tuple[str, ...]:
-    """Those that are installed, and nothing. Raises ValueError."""
+    """The chosen middlewares, and "nothing". Raises ValueError if one is not installed."""
     from lpac.middleware.kinds import MIDDLEWARES, NOTHING
 
     for name in given or ():
@@ -157,7 +157,7 @@ def _plan(experiment: "Experiment", middlewares: tuple[str, ...], of: NetworkOpt
 
 
 def require_namespaces(namespaces: str | None, robots: int | None) -> None:
-    """Raises ValueError, OSError if all experiments with so many robots could not run there."""
+    """Raise ValueError or OSError if the experiments with `robots` cannot run there."""
     plans = [_plan(each, (), NetworkOptions(robots=robots)) for each in _experiments(None)]
     _places(namespaces, max(plan.places for plan in plans))
 
@@ -203,7 +203,7 @@ def _measured_on(places: Sequence["NetworkPlace"], plan: "Plan") -> dict[str, An
 def _measure(
     plans: Sequence["Plan"], places: Sequence["NetworkPlace"]
 ) -> "Generator[Run, None, None]":
-    """Each run as it is made."""
+    """Yield each run, with progress on stderr."""
     from lpac.middleware.figures import title_of
     from lpac.middleware.measure import measure
 
@@ -294,7 +294,7 @@ def _print_summaries(columns: _Columns, summaries: "Sequence[Summary]") -> None:
 
 
 def _number(spread: "Spread | None", factor: float = 1.0, digits: int = 1) -> str:
-    """The mean, and the deviation if there is one."""
+    """Mean, and deviation if there is one."""
     if spread is None:
         return ""
     mean = f"{factor * spread.mean:.{digits}f}"

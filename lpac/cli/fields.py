@@ -53,7 +53,7 @@ def options_of(*classes: type[Any]) -> Callable[[Callable[..., None]], Callable[
 
 
 def chosen(cls: type[Any], *names: str, **flags: str) -> type[Any]:
-    """A dataclass of some fields alone; `flags` name their options otherwise."""
+    """Make a dataclass of some fields of `cls`; `flags` rename their options."""
     hints, defaults = _hints(cls), {each.name: each.default for each in fields(cls)}
     own = []
     for name in (*names, *flags):
@@ -66,7 +66,7 @@ def chosen(cls: type[Any], *names: str, **flags: str) -> type[Any]:
 
 
 def flag_of(name: str) -> str:
-    """The option of a field that has no other name."""
+    """Default name of a field's option."""
     for unit in _UNITS:
         name = name.removesuffix(unit)
     return f"--{name.replace('_', '-')}"
@@ -81,7 +81,7 @@ def _own(cls: type[Any], given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _parameter(cls: type[Any], of: Field[Any]) -> inspect.Parameter:
-    """A field as a parameter that typer makes an option of."""
+    """A field as a parameter that typer turns into an option."""
     hint = _hints(cls)[of.name]
     metadata = hint.__metadata__ if get_origin(hint) is Annotated else ()
     [info] = [each for each in metadata if isinstance(each, OptionInfo | ArgumentInfo | str)]
@@ -101,7 +101,7 @@ def _parameter(cls: type[Any], of: Field[Any]) -> inspect.Parameter:
 
 
 def _choices(hint: Any) -> tuple[str, ...]:
-    """The values of a field that has few; none of others."""
+    """Allowed values of a Literal, also within an Optional or a list; else ()."""
     if get_origin(hint) is Annotated:
         return _choices(hint.__origin__)
     if get_origin(hint) is Literal:

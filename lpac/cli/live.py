@@ -1,4 +1,4 @@
-"""Display of a fleet of programs while it runs: on stderr, and live on a terminal."""
+"""Display of a running fleet of programs on stderr, live on a terminal."""
 
 import time
 from collections import Counter
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from lpac.sim.fleet.listener import Statuses
 
 _DRAW_EVERY_S = 0.5
-# Between the names and the last column, which takes what is left.
+# Between the names and the last column, which fills the line.
 _COLUMNS = ("state", "x", "y", "height", "speed", "neighbours", "battery")
 
 
 class FleetDisplay:
-    """A context. `say` may be called from any thread."""
+    """Context manager; `say` may be called from any thread."""
 
     def __init__(
         self,
@@ -49,17 +49,17 @@ class FleetDisplay:
         self._live.stop()
 
     def say(self, text: str) -> None:
-        """A line with the time, above the table."""
+        """Print a line with the time, above the table."""
         self._told_s = self._clock()
         self._console.print(f"{self._told_s - self._began_s:6.1f} s  {text}", markup=False)
 
     def print(self, text: str) -> None:
-        """On stdout; the table, which may be on the same terminal, goes on below it."""
+        """Print on stdout, above the table."""
         running = self._live.is_started
         self._live.stop()
         typer.echo(text)
         if running:
-            # One that is started again would draw over the text.
+            # The old one, restarted, would draw over the text.
             self._live = self._new_live()
             self._live.start()
 
@@ -69,7 +69,7 @@ class FleetDisplay:
         return Live(console=self._console, auto_refresh=False, transient=True)
 
     def show(self, step: str, statuses: "Statuses") -> None:
-        """The table, where there is a terminal."""
+        """Draw the table, on a terminal only."""
         from rich.console import Group
 
         now_s = self._clock()
@@ -77,11 +77,11 @@ class FleetDisplay:
             self._told_s = now_s
             title = plain(f"{now_s - self._began_s:.0f} s: {step}")
             table = fleet_table(_row(robot, statuses.get(robot)) for robot in self._robots)
-            # The cursor stays behind a short line: Ctrl-C's echo breaks none then.
+            # An empty last line takes the echo of Ctrl-C.
             self._live.update(Group(title, table, ""), refresh=True)
 
     def show_or_say(self, step: str, statuses: "Statuses") -> None:
-        """The same; without a terminal, how many robots are in which state, every 10 s."""
+        """Draw the table; without a terminal, print the robots per state every 10 s."""
         if self._live.is_started:
             self.show(step, statuses)
         elif self._clock() - self._told_s >= LINE_EVERY_S:
@@ -99,7 +99,7 @@ def _row(robot: int, status: "RobotStatus | None") -> "Row":
 
 
 def fleet_table(rows: "Iterable[Row]") -> "Table":
-    """A line for each robot, whatever is in it and however wide the terminal is."""
+    """One line per robot, at any width of the terminal."""
     from lpac.ground.rendering import COLUMN, cell
 
     rows = list(rows)

@@ -1,4 +1,4 @@
-"""Options that several commands have, and what they mean."""
+"""Options shared by several commands."""
 
 import getpass
 import socket
@@ -39,7 +39,7 @@ DEFAULT_FLEET = Path("fleet.toml")
 DEFAULT_BUNDLE = SHIPPED_BUNDLE
 DEFAULT_SENSOR = "world"
 DEFAULT_ROBOTS = 10
-# The name of a lock has some hundred bytes.
+# The name of a lock is limited to about 100 bytes.
 _LOCK_BYTES = 80
 
 
@@ -65,7 +65,7 @@ IN_REAL_TIME = (VehicleKind.MAVLINK, VehicleKind.PX4)
 
 
 def check_px4(vehicle: VehicleKind, px4: Path | None) -> None:
-    """Raises ValueError where PX4s fly and their build is not given, or the other way round."""
+    """Raise ValueError if --vehicle px4 and --px4 are not given together."""
     if vehicle is VehicleKind.PX4 and px4 is None:
         raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
     if vehicle is not VehicleKind.PX4 and px4 is not None:
@@ -73,7 +73,7 @@ def check_px4(vehicle: VehicleKind, px4: Path | None) -> None:
 
 
 def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["RobotHost"]]:
-    """The fleet, and the robots that a command addresses. Raises ConfigError."""
+    """Load the fleet, and select a command's robots. Raises ConfigError."""
     from lpac.fleet.settings import load_fleet, select
 
     config = load_fleet(path)
@@ -96,13 +96,13 @@ def pool(ray: str | None) -> "Pool":
 
 
 def require_here(vehicle: VehicleKind, ray: str | None) -> None:
-    """Raise ValueError if flights in real time were to go to a cluster."""
+    """Raise ValueError for flights in real time on a cluster."""
     if vehicle in IN_REAL_TIME and ray is not None:
         raise ValueError(f"--ray does nothing with --vehicle {vehicle.value}: it flies here")
 
 
 def folder_lock(what: str, folder: Path) -> "ProcessLock":
-    """To be held by who works in the folder."""
+    """Lock against a second process in the folder."""
     from edge.drivers.process_lock import ProcessLock
 
     last_part = bytes(folder.resolve())[-_LOCK_BYTES:].decode(errors="ignore")
@@ -110,7 +110,7 @@ def folder_lock(what: str, folder: Path) -> "ProcessLock":
 
 
 def found(path: Path | None) -> Path | None:
-    """A callback of options: what is missing is told before anything slow is loaded."""
+    """Option callback: raise OSError for a missing file before slow imports."""
     if path is not None:
         path.stat()
     return path

@@ -1,4 +1,4 @@
-"""Tables, notes and colours, as all commands print them."""
+"""Tables, notes, colours and progress for all commands."""
 
 import threading
 import time
@@ -15,22 +15,22 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 GOOD, BAD, NOTABLE, FAINT = "green", "red", "yellow", "dim"
-# Of what `lpac.ground.rendering` says, where a command prints it.
+# Colours of the styles of `lpac.ground.rendering`.
 STYLES = {
     "": "", "good": GOOD, "calm": NOTABLE, "busy": NOTABLE, "foreign": NOTABLE, "faint": FAINT,
     "critical": BAD, "warning": NOTABLE, "note": FAINT,
 }  # fmt: skip
 
-# Where there is no terminal to show it live, how far a command is gets a line so often, s.
+# Period of progress lines without a terminal, s.
 LINE_EVERY_S = 10.0
 
 
 def print_table(
     headings: Sequence[str], rows: Sequence[Sequence["str | Text"]], right: Sequence[str] = ()
 ) -> None:
-    """A table on stdout; the headings in `right` are those of columns of numbers.
+    """Print a table on stdout; columns in `right` are right-aligned.
 
-    A first column of names of one word is for people to type again: they are never broken.
+    Names in the first column are never broken, unless they have spaces: people type them again.
     """
     from rich.console import Console
 
@@ -45,7 +45,7 @@ def print_table(
 
 
 def print_notes(notes: Sequence[tuple[str, "str | Text"]]) -> None:
-    """Lines of a robot's name and something about it, below a table."""
+    """Print lines of a robot's name and a note, below a table."""
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -58,7 +58,7 @@ def print_notes(notes: Sequence[tuple[str, "str | Text"]]) -> None:
 
 
 def styled(text: str, style: str) -> "Text":
-    """A cell or note in colour; brackets in it mean nothing."""
+    """A cell or note in colour, without rich's markup."""
     from rich.text import Text
 
     return Text(text, style)
@@ -82,17 +82,17 @@ def new_table(*, narrow: bool, heading: bool = True) -> "Table":
 
 @contextmanager
 def lines_of(how_far: Callable[[], str]) -> Iterator[None]:
-    """A line on stderr every `LINE_EVERY_S`, as long as this context lasts.
+    """Within this context, print `how_far()` on stderr every `LINE_EVERY_S`, without a terminal.
 
-    For where there is no terminal, and once more in the end if it says something else than the
-    last. `how_far` is called in another thread.
+    Once lines were printed, a changed last one is also printed at the end. `how_far` is called in
+    another thread.
     """
     ended = threading.Event()
     last = ""
 
     def tell() -> None:
         nonlocal last
-        # A pipe that nobody reads any more does not end the work.
+        # A closed pipe must not end the work.
         with suppress(OSError):
             while not ended.wait(LINE_EVERY_S):
                 last = how_far()
@@ -111,9 +111,9 @@ def lines_of(how_far: Callable[[], str]) -> Iterator[None]:
 
 
 class LiveView:
-    """On stderr: `render` again and again on a terminal; elsewhere a line of `how_far` at times.
+    """Progress on stderr: `render` live on a terminal, else lines of `how_far`.
 
-    Without `live` there is no live part on a terminal either, such as beside JSON on stdout.
+    Without `live` a terminal gets lines too, for example with JSON on stdout.
     """
 
     def __init__(
@@ -130,18 +130,18 @@ class LiveView:
         self._began_s = time.monotonic()
 
     def line(self, text: str) -> None:
-        """A line with the time since the view began, which stays."""
+        """Print a permanent line with the time since the view began."""
         self._console.print(self._timed(text), soft_wrap=True)
 
     @contextmanager
     def shown(self) -> Iterator[None]:
-        """The view, as long as this context lasts."""
+        """Show the view within this context."""
         with self._live if self.is_live else lines_of(lambda: self._timed(self._how_far())):
             yield
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Nothing live, as long as this context lasts: a question is asked."""
+        """Stop the live view within this context, for a question."""
         self._live.stop()
         yield
         if self.is_live:
@@ -153,7 +153,7 @@ class LiveView:
 
 @contextmanager
 def progress_of(what: str) -> Iterator["Progress"]:
-    """On stderr: how many are done of how many, the time left, and each task's description."""
+    """Progress on stderr: done of total, time left, and each task's description."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -184,7 +184,7 @@ def progress_of(what: str) -> Iterator["Progress"]:
 
 @contextmanager
 def progress_of_run() -> Iterator[Callable[[float, str, Sequence[str]], None]]:
-    """One bar for a run of hours, on stderr: the share that is done, what is done now, numbers."""
+    """Progress bar on stderr for a long run: present stage, share done, numbers."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
@@ -208,7 +208,7 @@ def progress_of_run() -> Iterator[Callable[[float, str, Sequence[str]], None]]:
 
 @contextmanager
 def working(text: str) -> Iterator[None]:
-    """Say on stderr what is being done, as long as it takes."""
+    """Show `text` on stderr within this context."""
     from rich.console import Console
 
     console = Console(stderr=True, highlight=False, markup=False)
@@ -221,7 +221,7 @@ def _shown(progress: "Progress", how_far: Callable[[], str]) -> AbstractContextM
 
 
 def time_left(left_s: float | None) -> list[str]:
-    """Words for the time that is left: none if it is not known."""
+    """Text of the time left, in a list; empty if it is unknown."""
     if left_s is None:
         return []
     minutes = round(left_s / 60.0)

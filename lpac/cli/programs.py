@@ -1,4 +1,4 @@
-"""A fleet of programs that `lpac sim` runs in real time, on the terminal."""
+"""Terminal side of the fleets of programs that `lpac sim` runs in real time."""
 
 import shlex
 import signal
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 def serve(fleet: "Fleet", fleet_toml: Path, display: "FleetDisplay") -> None:
-    """Run the fleet for `lpac ground` until Ctrl-C, and only listen to it.
+    """Run the fleet for `lpac ground` until Ctrl-C; it is not commanded from here.
 
-    `fleet_toml` is its description, as the user knows it.
+    `fleet_toml` is the path of its description in the printed commands.
     """
     from edge.core.counted import counted
 
@@ -36,15 +36,15 @@ def serve(fleet: "Fleet", fleet_toml: Path, display: "FleetDisplay") -> None:
         try:
             _watch_over(fleet, display)
         finally:
-            # The robots' programs must be ended, whoever is in a hurry.
+            # A second Ctrl-C must not leave robots' programs behind.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, signal.SIG_IGN)
 
 
 def _watch_over(fleet: "Fleet", display: "FleetDisplay") -> None:
-    """Say once that this machine does not keep up, and of each robot that its program has ended.
+    """Report once if this machine does not keep up, and each program that ends.
 
-    Raises FleetError if all have, VehicleError if a vehicle has ended.
+    Raises SimulatedFleetError once all programs have ended, VehicleError if a vehicle has ended.
     """
     from lpac.sim.fleet.processes import OverloadError, SimulatedFleetError
 
@@ -67,7 +67,7 @@ def _watch_over(fleet: "Fleet", display: "FleetDisplay") -> None:
 
 
 def as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
-    """As many robots as this machine carries, from 1 to 10; says how many."""
+    """Number of robots that this machine can run, from 1 to 10; prints it."""
     from lpac.sim.fleet.load import robots_carried
 
     carried = int(robots_carried(bundle, vehicle))
@@ -79,9 +79,9 @@ def as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
 def say_if_carried(
     robots: int | None, bundle: Path, vehicle: Literal["mavlink", "px4"]
 ) -> int | None:
-    """How many robots this machine carries; says so, and what to do if they are too few.
+    """Print and return how many robots this machine can run, with advice if they are too few.
 
-    None, and nothing, if they were chosen by that.
+    None, without output, if `robots` is None: their number was chosen in this way.
     """
     from lpac.sim.fleet.load import robots_carried
 

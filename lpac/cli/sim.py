@@ -1,4 +1,4 @@
-"""`lpac sim`: a swarm in this process, or a whole fleet on this machine."""
+"""`lpac sim`: a swarm of points in this process, or a whole fleet on this machine."""
 
 import gc
 import json
@@ -45,7 +45,7 @@ _Hz = Annotated[float, Meta(ge=0.1, le=100.0)]
 
 
 class Scale(StrEnum):
-    """How large the model's world is in the air."""
+    """Size of the model's world in the air."""
 
     FIELD = "field"
     MODEL = "model"
@@ -53,7 +53,7 @@ class Scale(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOptions:
-    """Options of how it is flown."""
+    """Options of the engine and its output."""
 
     vehicle: Annotated[
         VehicleKind,
@@ -81,7 +81,7 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightOptions:
-    """Options that a scenario has in another form."""
+    """Options that are not fields of a scenario as they are."""
 
     robots: Annotated[
         str | None,
@@ -135,7 +135,7 @@ class FlightOptions:
     wifi: WifiFile = None
 
 
-# Options of a scenario's fields, where these are not the field's name.
+# Options of a scenario's fields that are not named after the field.
 _NAMED = {"random_feature_count": "--features", "communication_range": "--range"}
 _FLAGS = {**_NAMED, "failures": "--lost", "radio": "--transport", "clocks": "--policy-hz"}
 
@@ -184,7 +184,7 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
 
 @contextmanager
 def _told_as_option(beside: str) -> Iterator[None]:
-    """Raise ValueError that names the option of a field which does nothing beside another."""
+    """Convert an UnableError to a ValueError that names the option without effect."""
     from lpac.sim.scenario import UnableError
 
     try:
@@ -195,11 +195,11 @@ def _told_as_option(beside: str) -> Iterator[None]:
 
 
 def _require_able(scenario: "Scenario", run: RunOptions) -> None:
-    """Raise ValueError that names an option which does nothing."""
+    """Raise ValueError that names an option without effect."""
     from lpac.sim.engines import engine_of
 
     if scenario.controller != "lpac":
-        # A baseline senses and decides at once, and nothing is sent.
+        # Baselines have no separate loops and send nothing.
         with _told_as_option(f"--controller {scenario.controller}"):
             scenario.require_default(
                 "baselines", "clocks", "payload", "loss", "delay_s", "max_message_age_s"
@@ -211,9 +211,9 @@ def _require_able(scenario: "Scenario", run: RunOptions) -> None:
 def _scenario(
     run: RunOptions, drawn: FlightOptions, of_scenario: Any, count: int | None
 ) -> "Scenario":
-    """Build the scenario of the options; of one robot where the machine decides how many.
+    """Build the options' scenario, with one robot if `count` is None (auto).
 
-    Raises ValueError for what is impossible, or would do nothing.
+    Raises ValueError for impossible options, or options without effect.
     """
     from edge.core.frames import ModelScale
     from edge.core.world import parse_world
@@ -274,7 +274,7 @@ def _clocks(drawn: FlightOptions) -> Any:
 
 
 def _robot_count(text: str | None, vehicle: VehicleKind) -> int | None:
-    """None for auto."""
+    """Parse --robots; None for auto."""
     if text is None:
         return None if vehicle in IN_REAL_TIME else DEFAULT_ROBOTS
     if text == "auto":
@@ -291,7 +291,7 @@ def _robot_count(text: str | None, vehicle: VehicleKind) -> int | None:
 
 
 def fly_showing(scenarios: list[tuple[str, "Scenario"]], bundle: Path) -> list["FlightRecord"]:
-    """Simulate the named scenarios; how far each is goes to stderr."""
+    """Simulate the named scenarios, with progress on stderr."""
     from edge.drivers.registry import load_policy
     from edge.policy.family import verified
     from lpac.sim.engines import Points, loaded_bundle
@@ -301,7 +301,7 @@ def fly_showing(scenarios: list[tuple[str, "Scenario"]], bundle: Path) -> list["
         problem = verified(load_policy(loaded_bundle(str(bundle)))).problem
         if problem:
             typer.echo(f"warning: {bundle}: {problem}: no robot takes off with it", err=True)
-    gc.freeze()  # what is loaded by now stays: not to be looked through during the flight
+    gc.freeze()  # keep the collector off loaded modules during the flight
     records = []
     with progress_of("s flown:") as progress:
         for name, scenario in scenarios:
@@ -336,7 +336,7 @@ def _fly_programs(scenario: "Scenario", run: RunOptions, count: int | None) -> "
     def show(moment: FleetMoment) -> None:
         display.show_or_say(moment.step, moment.statuses)
 
-    # Whoever stops this program means the fleet too.
+    # SIGTERM must end the fleet as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     carries = partial(say_if_carried, count, run.bundle, _programs(run))
     with FleetDisplay(scenario.robots) as display:
@@ -430,7 +430,7 @@ def _tell_of_features_outside(
     bundle: Path,
     world_size: int | None,
 ) -> None:
-    """Whoever makes the world smaller may not think of them."""
+    """Warn about features outside of the world, for example after --world-size."""
     from edge.core.world import GaussianFeature
     from edge.policy.bundle import load_bundle
 
@@ -455,7 +455,7 @@ def _tell_of_features_outside(
 def _starts(
     path: Path, robots: int | None, bundle: Path, scenario: "Scenario"
 ) -> tuple[tuple[float, float], ...]:
-    """The positions in the file, m. Raises ValueError that names the line; BundleError."""
+    """Read start positions, m. Raises ValueError that names the line; BundleError."""
     from edge.policy.bundle import load_bundle
 
     side_m = scenario.perception_of(load_bundle(bundle)).world_size / scenario.scale.env_scale

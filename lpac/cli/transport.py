@@ -1,4 +1,4 @@
-"""The radio that simulated points fly with: `--transport`, `--wifi`, and what the model says."""
+"""The simulated points' radio: `--transport`, `--wifi`, and the model's assumptions."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lpac.radio import airtime
     from lpac.radio.calibration import Calibration, Source
 else:
-    # Only commands that have these options load this file.
+    # Only commands with these options import this module.
     airtime = _airtime()
 
 Transport = airtime.Transport
@@ -43,7 +43,7 @@ def calibration(wifi: Path | None, *, transport: bool) -> "Calibration":
 
 
 def wifi_lines(found: "Calibration") -> list[str]:
-    """Each value of the channel, as TOML, with what it comes from."""
+    """Each value of the channel as TOML, with its origin."""
     return [
         f"{name} = {_toml(getattr(found.wifi, name))}  # {_text(source)}"
         for name, source in found.sources.items()

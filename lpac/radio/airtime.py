@@ -82,13 +82,12 @@ def state_bytes(robots: float) -> float:
 class Wifi(Bounded):
     """One channel and its access point.
 
-    `data_rate_mbit_s` is what stations and access point send frames to one receiver at,
-    `multicast_rate_mbit_s` what the access point sends to a group at. `frame_loss` is the
-    probability that one transmission of one frame is lost for reasons other than collisions.
-    `queue_s` is how long something waits in queues that are full. `ground_wired`: the ground is at
-    the access point's wire; else it is one more station.
+    `data_rate_mbit_s` is the rate of frames to one receiver, `multicast_rate_mbit_s` the access
+    point's rate to a group. `frame_loss` is the probability that one transmission of one frame is
+    lost for reasons other than collisions. `queue_s` is the waiting time in full queues.
+    `ground_wired`: the ground is wired to the access point; else it is one more station.
 
-    The values that stand here are what docs/network.md assumes.
+    The defaults are the assumptions of docs/network.md.
 
     Raises ValueError that names an impossible value.
     """
@@ -104,8 +103,8 @@ class Wifi(Bounded):
 class Traffic(Bounded):
     """Traffic of a fleet in flight; sizes are those of sealed messages, before any framing.
 
-    `message_bytes` and `message_hz` are of what a robot tells its neighbours, `status_hz` of what
-    it tells the ground. Orders and worlds are left out: they are sent at moments.
+    `message_bytes` and `message_hz` are of a robot's messages to its neighbours, `status_hz` of its
+    statuses to the ground. Orders and worlds are left out, since they are rare.
 
     Raises ValueError that names an impossible value.
     """
@@ -118,13 +117,12 @@ class Traffic(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class Airtime:
-    """How much of the channel's time is asked for: above 1 in `total` it does not get it.
+    """Share of the channel's time that the traffic needs; the channel is overloaded above 1.
 
-    `shares` are by topic, with the idle slots and gaps that it takes to get a turn. `busy` is the
-    share without them, in which somebody sends: so a radio counts it. `message_s` is what one
-    robot's message to all its receivers takes, acknowledgements included, `contenders` how many
-    stations want to send at once, on average, and `collision` the probability that a transmission
-    collides.
+    `shares` are by topic, with the idle slots and gaps of contention. `busy` is the share without
+    them, as radios count it. `message_s` is the airtime of one robot's message to all its receivers
+    with acknowledgements, `contenders` the mean number of stations that want to send at once, and
+    `collision` the probability that a transmission collides.
     """
 
     shares: Mapping[str, float]
@@ -135,12 +133,12 @@ class Airtime:
 
     @property
     def total(self) -> float:
-        """Of all topics."""
+        """Sum over all topics."""
         return math.fsum(self.shares.values())
 
 
 class LinkQuality(NamedTuple):
-    """From one robot to another: the probability that a message is lost, and the mean delay, s."""
+    """Loss probability and mean delay, s, of a message from one robot to another."""
 
     loss: float
     delay_s: float

@@ -1,4 +1,4 @@
-"""Measurements of a check of the radio, and the records that are kept."""
+"""Measurements of a radio check, and records of them."""
 
 import math
 import statistics
@@ -11,10 +11,9 @@ from lpac.radio.records import RadioRecord
 
 
 class WifiReading(NamedTuple):
-    """Readings of a robot's radio; None where it told none.
+    """A robot's radio: its send rate, its received signal, and the channel's busy share.
 
-    At which rate it sends, how strong it hears, and the share of the channel's time in which it
-    heard anybody send.
+    None where the radio reports no value.
     """
 
     rate_mbit_s: float | None = None
@@ -23,13 +22,13 @@ class WifiReading(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """`robots` are the names of those that are judged, `windows` of all that were heard.
+    """Measurements of the judged `robots`.
 
-    Of the fleet: what others of it say is on the air, too. `wifi` is of those whose radios were
-    asked. Each message travels in an envelope of `overhead_bytes`. In flight it has `flight_bytes`,
-    sealed, if that is more: robots on the ground have no map to tell of. `loaded`: something else
-    was sent meanwhile, on purpose. `ground_wired`: the ground's computer is not in the Wi-Fi
-    itself.
+    `windows` are of all robots of the fleet that were heard, since they all take airtime. `wifi`
+    has the radios that were read. Each message has an envelope of `overhead_bytes`. Sealed messages
+    in flight have at least `flight_bytes`, since robots on the ground have no map to send.
+    `loaded`: a bulk stream was sent meanwhile. `ground_wired`: the ground's computer is not on the
+    Wi-Fi.
     """
 
     robots: tuple[str, ...]
@@ -43,7 +42,7 @@ class Checked(NamedTuple):
 
     @property
     def traffic(self) -> Traffic | None:
-        """Mean traffic, sealed, of those that spoke; None if nobody did."""
+        """Mean traffic of the robots that sent, sealed; None if none did."""
         speaking = [window for window in self.windows.values() if window.sent > 0]
         if not speaking:
             return None
@@ -56,18 +55,18 @@ class Checked(NamedTuple):
 
     @property
     def expected_loss(self) -> float:
-        """Of a message, by a radio that is as docs/network.md assumes."""
+        """Share of messages that the radio of docs/network.md loses."""
         traffic = self.traffic
         if traffic is None:
             return 0.0
         return lost_for_good(self.transport, Wifi(), traffic.message_bytes)
 
     def pairs(self) -> tuple[Pair, ...]:
-        """Of those that are judged."""
+        """Pairs of the judged robots."""
         return pairs({name: self.windows[name] for name in self.robots if name in self.windows})
 
     def records(self, found: Sequence[Pair]) -> list[RadioRecord]:
-        """One of each pair that was found in the windows, for a model of this field's radio."""
+        """A record per pair, for a model of this field's radio."""
         return [self._record(pair) for pair in found]
 
     def _record(self, pair: Pair) -> RadioRecord:

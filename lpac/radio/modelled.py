@@ -1,4 +1,4 @@
-"""The radio that simulated robots fly with: what the model says of a team on one channel."""
+"""The simulated robots' radio: the model of a team on one channel."""
 
 from dataclasses import dataclass, field
 
@@ -17,10 +17,10 @@ from lpac.radio.airtime import (
 
 @dataclass(frozen=True, slots=True)
 class ModelledRadio(Bounded):
-    """How a team's messages travel: all of it shares one channel and reaches its access point.
+    """A team's radio: all robots share one channel, and reach its access point.
 
-    So whoever flies takes airtime, from the first to the last second, wherever it is: a field of
-    300 robots, ten in 32 x 32 m, is 175 m wide. Who has use for a message is another matter.
+    Each robot takes airtime during the whole flight, wherever it is: 300 robots, at ten in
+    32 x 32 m, cover a field 175 m wide.
 
     Raises ValueError for another transport.
     """
@@ -31,7 +31,7 @@ class ModelledRadio(Bounded):
     def link(
         self, robots: int, payload: PayloadType, message_hz: float = MESSAGE.rate_hz
     ) -> LinkQuality:
-        """From one robot to another, in a team of so many that say what the field policy does."""
+        """Quality of a link in a team of `robots` with the field policy's messages."""
         traffic = Traffic(
             robots=robots, message_bytes=MESSAGE_BYTES[payload], message_hz=message_hz
         )

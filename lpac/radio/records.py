@@ -25,14 +25,14 @@ _Name = Annotated[str, Meta(min_length=1, description="a name")]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadioRecord(Bounded):
-    """Link from `sender` to `receiver` while `robots` of them spoke; None: it is not known.
+    """Link from `sender` to `receiver` while `robots` robots sent; None where unknown.
 
     `sender_heading_deg` is the true heading of the sender's nose, clockwise from north, and
-    `receiver_height_m` above its own takeoff point. Of `sent` messages of `message_bytes`, sealed,
-    said `message_hz` times a second to each that is to hear them, `received` arrived; ages are how
-    long those travelled. `rate_mbit_s` and `signal_dbm` are of the receiver's Wi-Fi, `busy_share`
-    is the share of the channel's time that somebody sent in, by anybody. `loaded`: a bulk stream
-    was sent meanwhile, on purpose. `ground_wired`: the ground was not in the Wi-Fi.
+    `receiver_height_m` is above its own takeoff point. The sender sends `sent` sealed messages of
+    `message_bytes` at `message_hz`, of which `received` arrived; ages are their travel times.
+    `rate_mbit_s` and `signal_dbm` are of the receiver's Wi-Fi; `busy_share` is the share of time in
+    which any station sent. `loaded`: a bulk stream was sent meanwhile. `ground_wired`: the ground
+    was not on the Wi-Fi.
 
     Raises ValueError that names an impossible value.
     """
@@ -58,7 +58,7 @@ class RadioRecord(Bounded):
 
     @property
     def is_of_radio(self) -> bool:
-        """Whether a radio told anything; robots of `lpac sim` have none."""
+        """Whether a radio reported a value; robots of `lpac sim` have no radio."""
         return any(v is not None for v in (self.rate_mbit_s, self.signal_dbm, self.busy_share))
 
     def check_rules(self) -> None:
