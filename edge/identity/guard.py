@@ -170,7 +170,7 @@ class Guard(ABC):
         return frozenset()
 
     def receive_time(self, unix_s: float) -> None:  # noqa: B027  (no use in an open fleet)
-        """Take a lower bound of the time, by which future starts are refused."""
+        """Take a lower bound of the wall-clock time; starts a day beyond it are refused."""
 
     def pop_unreadable_robots(self) -> set[int]:
         """Robots that sent envelopes of another version since the last call."""
@@ -199,7 +199,7 @@ class Guard(ABC):
         if envelope is not None:
             found = self._authenticate(topic, key, envelope)
         elif robot_id is not None and is_of_other_version(data):
-            # The signature is unknown in this version: that robot may not have sent it.
+            # Its signature cannot be verified here: the robot may not have sent it.
             with self._lock:
                 self._unreadable_robots.add(robot_id)
         if not isinstance(found, RefusedMessage) and topic.deflated:
@@ -408,7 +408,7 @@ class SignedGuard(Guard):
         number, fingerprint = head.number, head.fingerprint
         now_s, offset_s = self._clock_s(), self._unix_offset_s
         unix_s = None if offset_s is None else now_s + offset_s
-        # Robots alone: a ground whose clock was wrong once would be out of reach in flight.
+        # For robots only: a ground whose clock was wrong once could not command in flight.
         is_robot = sender.role is Role.ROBOT
         is_own = fingerprint == self._own.fingerprint and is_robot
         with self._lock:

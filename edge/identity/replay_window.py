@@ -23,9 +23,9 @@ NO_NUMBER = MessageNumber(-1, -1)
 class ReplayWindow:
     """The newest number of a sender; one thread at a time.
 
-    A start ahead of the clock counts as the time of its first message. So a thief of a key cannot
-    outnumber the next start of the robbed program. A start that another has followed has ended for
-    good.
+    A start ahead of the clock counts as the time of its first message, so that a thief of the key
+    cannot outnumber the program's next start. Once another start has followed, a start is refused
+    for good.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class ReplayWindow:
         self._ended: deque[int] = deque(maxlen=_MOST_ENDED)
 
     def is_replay(self, number: MessageNumber, now_s: float, unix_s: float | None) -> bool:
-        """Whether `number` is a replay, or a newer message has overtaken it.
+        """Whether `number` is a replay, or a newer message arrived before it.
 
         `now_s` is a monotonic clock's time, `unix_s` the wall clock's, None if not known.
         """

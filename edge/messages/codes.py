@@ -12,7 +12,7 @@ from edge.messages.bounds import MOST_LETTERS, Text
 
 
 class _Code(StrEnum):
-    """Codes of which unknown ones, from a newer release, become OTHER."""
+    """Codes; one that is unknown in this release becomes OTHER."""
 
     @classmethod
     def _missing_(cls, value: object) -> Self | None:

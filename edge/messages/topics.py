@@ -53,7 +53,7 @@ EXPLORED = Topic("explored", "robot", "bits", 1.0, 5, 2**10, "later", None)
 # Room for ten grounds: one that floods, such as a revoked laptop, must not drown another's hold.
 # `most_of_one_hz` drops a message that follows the last too closely, so orders have none: those for
 # all robots go at once.
-# A ground says its state at each of its ticks, 5.5 times a second, while a robot hears it late.
+# A ground publishes STATE at each tick, 5.5 times a second, while a robot receives it late.
 STATE = Topic("state", "ground", "GroundState", 2.5, 500, 2**16, "now", "ground", 50)
 HOLD = Topic("hold", "ground", "Hold", 5.0, 500, 2**14, "now", None, 50)
 ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")

@@ -44,7 +44,7 @@ class _Robot:
     number: Number
     beacon: ReceivedBeacon
     message_number: Number = _NO_NUMBER
-    # Messages that the last swap took, and that arrived since.
+    # Handed out by the last swap, and received since.
     handed_out: ReceivedMessage | None = None
     received: ReceivedMessage | None = None
     accepted: int = 0

@@ -53,7 +53,7 @@ from edge.robot.readiness import Readiness
 _EXPLORED_PERIOD_S = 1.0
 # The checks of an armed vehicle are only displayed.
 _ARMED_CHECKS_PERIOD_S = 0.95
-# Without an urgent change. A little less than the rate's, since ticks are never early.
+# Without an urgent change; slightly below the rate's period, since ticks are never early.
 _STATUS_PERIOD_S = 1.0 / STATUS.rate_hz - 0.05
 # The counts are long, and used for differences over many seconds.
 _RADIO_COUNTS_PERIOD_S = 1.9

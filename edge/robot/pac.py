@@ -68,9 +68,9 @@ class PacParameters(Bounded):
 
 
 def message_bytes(policy: Policy, payload: PayloadType) -> tuple[int, int]:
-    """Sizes of a robot's message, with beacon and envelope: without a map, and with the largest.
+    """Sizes of a robot's uncompressed message: without a map, and with one.
 
-    Both if nothing compresses: most maps do.
+    Beacon and envelope are included. Most maps compress well.
     """
     perception = policy.manifest.perception
     side = perception.shared_map_side if perception else 0
@@ -152,7 +152,7 @@ class Pac:
         )
         self._memory = RobotMemory(manifest.perception)
         self._agent = policy.agent()
-        # Set from any thread, obeyed by the thread of the memory or of the agent.
+        # Requests from any thread to the thread of the memory or of the agent.
         self._forget_map = False
         self._reset_agent = False
         # The present mission, and the map's: maps of another mission are not merged.
@@ -262,9 +262,9 @@ class Pac:
     def infer(self, now_s: float, *, on_ground: bool = False) -> PolicyTick | None:
         """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
 
-        None without fresh features, a position, or a valid `PolicyStep`. The last action then grows
-        old, and `control` stops the robot; so it does when this raises. Raises PartError if the
-        policy raises anything.
+        None without fresh features, a position, or a valid `PolicyStep`. Then, or if this raises,
+        the last action grows old and `control` stops the robot. Raises PartError if the policy
+        raises anything.
 
         `on_ground`: the message is as large as in flight, to test the radio.
         """
@@ -340,7 +340,7 @@ class Pac:
         return odometry if all(map(math.isfinite, numbers)) else None
 
     def _look(self, own: F64, height_m: float) -> tuple[F32, Bools | None] | None:
-        """The sensor's view, and the seen part if not all; None without a valid view."""
+        """The sensor's view, and its seen cells (None: all); None without a valid view."""
         shown: tuple[F32, Bools | None] | None
         try:
             sensor = self.sensor

@@ -52,11 +52,11 @@ from edge.robot.pac import message_bytes
 
 # Period of preflight checks, status, reports to systemd, and writing the flight log.
 _PERIOD_S = 0.25
-# Checks of a running robot: `check` publishes nothing, so it gets no time, and does not perceive.
+# `check` cannot pass these: it publishes nothing, so it gets no time, and it does not perceive.
 _ONLY_RUNNING = (CheckCode.TIME_NOT_KNOWN, CheckCode.NO_FRESH_ANSWER)
 # Period of the loops' statistics, which cover a minute.
 _LOOPS_PERIOD_S = 1.0
-# A control loop without a tick for longer hangs; the watchdog has acted before.
+# A control loop without a tick for longer counts as hanging; the watchdog acts sooner.
 _CONTROL_FRESH_S = 1.0
 # Timeouts at the program's end: for the autopilot's answer, and for a loop to end.
 _ANSWER_S = 1.2

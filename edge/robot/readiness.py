@@ -25,7 +25,7 @@ from edge.robot.config import RobotConfig
 # Others may change parameters and fence at any time.
 _READ_PERIOD_S = 1.5
 _RETRY_S = 3.0
-# A change in flight that lasts longer is not being restored.
+# A change in flight that lasts longer counts as not restored.
 _RESTORED_WITHIN_S = 3.5
 
 _MAX_ANSWER_AGE_S = 2.0
@@ -123,7 +123,7 @@ class Readiness:
         if now_s >= self._fence_due_s:
             self._fence_due_s = now_s + _RETRY_S
             self._upload_fence(origin, fence)
-            # Later, so that a repeated change by others is found.
+            # Wait before the next read, so that it finds a repeated change by others.
             self._read_due_s = max(self._read_due_s, now_s + _READ_PERIOD_S)
 
     def _forget(self) -> None:

@@ -104,4 +104,4 @@ def _only_vehicle(autopilot: Vehicle, wait_s: float) -> int:
 def _refuse_unless_disarmed(state: VehicleState) -> None:
     if not state.connected or state.armed is not False:
         word = "armed" if state.connected and state.armed else "not known to be disarmed"
-        raise SetupError(f"the vehicle is {word}: nothing is set")
+        raise SetupError(f"the vehicle is {word}: nothing was set; disarm it first")

@@ -44,7 +44,7 @@ def test_nothing_is_set_on_an_armed_vehicle_nor_where_there_are_two(tmp_path: Pa
         before = dict(vehicle.parameters)
         code, _, errors = setup(made.config.autopilot.url, 11)
         assert code == 1
-        assert errors == "lpac: the vehicle is armed: nothing is set\n"
+        assert errors == "lpac: the vehicle is armed: nothing was set; disarm it first\n"
         assert vehicle.parameters == before
     other = Px4Link(new_vehicle(), system_id=9)
     with rig(tmp_path, new_vehicle(), other) as made:
