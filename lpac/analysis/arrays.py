@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F64
-from edge.drivers.flight_log import FlightLogError, Missing, read
+from lpac.analysis.log_reader import FlightLogError, LogGap, read
 
 _NOT_FINITE = frozenset({"NaN", "Infinity", "-Infinity"})
 
@@ -59,14 +59,14 @@ def log_arrays(path: Path | str, *topics: str) -> dict[str, dict[str, Columns]]:
     if not paths:
         raise ValueError(f"{path}: holds no logs (*.mcap)")
     found: dict[str, dict[str, _Messages]] = {}
-    gaps: list[Missing] = []
+    gaps: list[LogGap] = []
     for file in paths:
         numbered = re.fullmatch(r"(.+)-\d+", file.stem)
         log = found.setdefault(
             numbered[1] if numbered else file.stem, {topic: _Messages() for topic in topics}
         )
         try:
-            for topic, time_s, message in read(file, *topics, missing=gaps.append):
+            for topic, time_s, message in read(file, *topics, on_gap=gaps.append):
                 log.setdefault(topic, _Messages()).add(time_s, message)
         except FlightLogError as error:
             if not path.is_dir():

@@ -7,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F32, F64
-from edge.core.coverage import cell_corners, coverage_cost, voronoi_cells
 from edge.core.world import Feature, parse_world, rasterize
 from edge.messages.mission import STEERED, FlightState, RobotStatus
 from lpac.analysis.mission_tracker import MissionStatus
 from lpac.analysis.snapshot import FleetSnapshot
+from lpac.analysis.voronoi import cell_corners, coverage_cost, voronoi_cells
 
 # Ten with the given positions.
 _RANDOM_STARTS = 9

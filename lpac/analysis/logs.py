@@ -24,7 +24,7 @@ from edge.core.changes import plain
 from edge.core.counted import counted
 from edge.core.fence import Fence
 from edge.core.schema import explain
-from edge.drivers.flight_log import FlightLogError, FlightMetadata, Missing, read, read_metadata
+from edge.drivers.flight_log import FlightMetadata
 from edge.messages.codes import Reason, Refusal
 from edge.messages.mission import FlightState, LoopStatus, Origin, RobotStatus
 from lpac.analysis.field_truth import (
@@ -35,6 +35,7 @@ from lpac.analysis.field_truth import (
     read_places,
     track_of,
 )
+from lpac.analysis.log_reader import FlightLogError, LogGap, read, read_metadata
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.truth import TRUTH, TrueTrack, load_truth
 
@@ -226,8 +227,8 @@ class _LogReader:
             else:
                 take = partial(self._take_from_robot, self._begin_robot(path))
                 topics = ("status", "received", "order")
-            gaps: list[Missing] = []
-            for topic, time_s, message in read(path, *topics, missing=gaps.append):
+            gaps: list[LogGap] = []
+            for topic, time_s, message in read(path, *topics, on_gap=gaps.append):
                 begun = True
                 try:
                     take(topic, time_s, message)

@@ -23,7 +23,7 @@ def trials(
 
     In JSON: file -> trial -> [first, last] Unix time, s; the time without a trial is under "".
     """
-    from edge.drivers.flight_log import FlightLogError
+    from lpac.analysis.log_reader import FlightLogError
 
     uptimes: dict[Path, _Uptimes] = {}
     began_s: dict[tuple[str, str], float] = {}
@@ -54,10 +54,10 @@ def _uptimes(path: Path, began_s: dict[tuple[str, str], float]) -> _Uptimes:
     Uptime never jumps, unlike the robots' clocks. `began_s` gets each program's start by the last
     state of its clock.
     """
-    from edge.drivers.flight_log import read
+    from lpac.analysis.log_reader import read
 
     times: _Uptimes = {}
-    for _, time_s, status in read(path, "status", missing=_say):
+    for _, time_s, status in read(path, "status", on_gap=_say):
         uptime_s = status.get("uptime_s")
         program = (path.stem.rpartition("-")[0], str(status.get("boot_nonce")))
         if not (isinstance(uptime_s, float | int) and 0.0 <= uptime_s <= time_s):
@@ -76,7 +76,7 @@ def repair(
     out: Annotated[Path, typer.Argument(help="The new file to write.")],
 ) -> None:
     """Copy the readable parts of a damaged log, and list the gaps."""
-    from edge.drivers.flight_log import repair
+    from lpac.analysis.log_reader import repair
 
     count = repair(log, out, _say)
     typer.echo(f"{out}: {count:,} messages")

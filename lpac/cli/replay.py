@@ -13,10 +13,11 @@ from lpac.cli.options import AsJson
 from lpac.cli.printing import working
 
 if TYPE_CHECKING:
-    from edge.drivers.flight_log import FlightMetadata, Missing
-    from edge.flight.replay import FlightReplay
+    from edge.drivers.flight_log import FlightMetadata
     from edge.policy.bundle import Bundle
-    from edge.policy.lpac.replay import Comparison
+    from lpac.analysis.flight_replay import FlightReplay
+    from lpac.analysis.log_reader import LogGap
+    from lpac.analysis.policy_replay import Comparison
 
 app = new_app()
 
@@ -32,7 +33,7 @@ class _RunAgain(NamedTuple):
     bundle: "Bundle | None"
     comparisons: "tuple[Comparison, ...]"
     flights: "Mapping[Path, FlightReplay]"
-    missing: "Sequence[Missing]"
+    missing: "Sequence[LogGap]"
 
     @property
     def has_flight(self) -> bool:
@@ -71,10 +72,10 @@ def replay(
 
 
 def _run_again(logs: list[Path], bundle: Path | None) -> _RunAgain:
-    from edge.drivers.flight_log import Missing
+    from lpac.analysis.log_reader import LogGap
 
     metadata = _metadata(logs)
-    missing = list[Missing]()
+    missing = list[LogGap]()
     of = _RunAgain(metadata, None, (), _flights(metadata, missing), missing)
     if _has_policy_ticks(metadata):
         policy_bundle, comparisons = _policy(metadata, bundle)
@@ -118,7 +119,7 @@ def _problems(of: _RunAgain) -> list[str]:
 
 def _metadata(logs: Iterable[Path]) -> "dict[Path, FlightMetadata]":
     """Metadata by segment. In a folder, files that are no flight logs are skipped."""
-    from edge.drivers.flight_log import FlightLogError, read_metadata
+    from lpac.analysis.log_reader import FlightLogError, read_metadata
 
     metadata = {}
     for path in _segments(logs):
@@ -138,10 +139,10 @@ def _policy(
     """The bundle, and comparisons of all its ticks with the log."""
     from itertools import chain
 
-    from edge.drivers.flight_log import read
     from edge.policy.bundle import BundleError, load_bundle
     from edge.policy.lpac.policy import LpacPolicy
-    from edge.policy.lpac.replay import replay as run_again
+    from lpac.analysis.log_reader import read
+    from lpac.analysis.policy_replay import replay as run_again
 
     bundle_path = given or Path(next(iter(metadata.values())).bundle_path)
     try:
@@ -160,34 +161,34 @@ def _policy(
         # The internal state of other families is not in the log.
         return bundle, ()
     messages = chain.from_iterable(
-        read(path, "perception", "policy", missing=_told_already) for path in metadata
+        read(path, "perception", "policy", on_gap=_told_already) for path in metadata
     )
     return bundle, run_again(LpacPolicy(bundle), messages)
 
 
 def _has_policy_ticks(paths: Iterable[Path]) -> bool:
-    from edge.drivers.flight_log import read
+    from lpac.analysis.log_reader import read
 
-    return any(True for path in paths for _ in read(path, "policy", missing=_told_already))
+    return any(True for path in paths for _ in read(path, "policy", on_gap=_told_already))
 
 
-def _told_already(_: "Missing") -> None:
+def _told_already(_: "LogGap") -> None:
     """Ignore a gap: `_flights`, which reads all logs, reports it."""
 
 
 def _flights(
-    metadata: "Mapping[Path, FlightMetadata]", missing: "list[Missing]"
+    metadata: "Mapping[Path, FlightMetadata]", missing: "list[LogGap]"
 ) -> "dict[Path, FlightReplay]":
     """Recompute the programs' flight decisions. A program's segments must be in order."""
-    from edge.drivers.flight_log import read
     from edge.flight.record import TickError, TickReader
-    from edge.flight.replay import FlightReplay
+    from lpac.analysis.flight_replay import FlightReplay
+    from lpac.analysis.log_reader import read
 
     readers: dict[FlightMetadata, TickReader] = {}
     flights = {}
     for path, program in metadata.items():
         flights[path] = flight = FlightReplay(readers.setdefault(program, TickReader()))
-        for _, unix_time_s, message in read(path, "flight", missing=missing.append):
+        for _, unix_time_s, message in read(path, "flight", on_gap=missing.append):
             try:
                 flight.run(unix_time_s, message)
             except TickError as error:

@@ -16,7 +16,6 @@ import numpy.typing as npt
 import scipy  # its parts are loaded on first use
 
 from edge.core import F32, F64, Bools
-from edge.core.coverage import cvt_velocity, local_centroid, voronoi_cells
 from edge.core.frames import ModelScale
 from edge.core.memory import RobotMap
 from edge.core.perception import (
@@ -27,6 +26,7 @@ from edge.core.perception import (
     window_corner,
 )
 from edge.drivers.world_sensor import WorldSensor
+from lpac.analysis.voronoi import cvt_velocity, local_centroid, voronoi_cells
 from lpac.sim.vehicles import PointVehicles
 
 BaselineName = Literal[

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F32, F64, Bools
-from edge.core.coverage import cvt_velocity, voronoi_cells
 from edge.core.perception import PerceptionParameters, window_corner
 from lpac.analysis.coverage import coarse, lloyd_ends
+from lpac.analysis.voronoi import cvt_velocity, voronoi_cells
 from lpac.sim.points import Preparation
 from lpac.train.config import DataConfig
 

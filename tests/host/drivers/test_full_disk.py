@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge.drivers.flight_log import FlightLog, FlightMetadata, Missing, read
+from edge.drivers.flight_log import FlightLog, FlightMetadata
 from edge.drivers.identity_folder import load_identity
 from edge.identity.members import Role
+from lpac.analysis.log_reader import LogGap, read
 from lpac.fleet.authority import create_authority, new_member
 from tests.needs import missing
 from tests.said import lines_said
@@ -57,11 +58,11 @@ def fill(disk: Path) -> Path:
 
 
 def numbers(folder: Path) -> list[int]:
-    missing: list[Missing] = []
+    missing: list[LogGap] = []
     return [
         message["number"]
         for path in sorted(folder.glob("robot-*.mcap"))
-        for _, _, message in read(path, missing=missing.append)
+        for _, _, message in read(path, on_gap=missing.append)
     ]
 
 

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from edge.core import F64
-from edge.core.coverage import coverage_cost
 from edge.core.world import rasterize
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+from lpac.analysis.voronoi import coverage_cost
 from lpac.ground.alarms import Before, alarms
 from lpac.ground.procedure import fresh_snapshot
 from lpac.ground.station.client import subscribe

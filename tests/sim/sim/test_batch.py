@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F32
-from edge.core.coverage import coverage_cost
 from edge.core.frames import ModelScale
 from edge.core.memory import RobotMemory
 from edge.core.perception import PerceptionParameters
@@ -24,6 +23,7 @@ from edge.policy.bundle import Bundle
 from edge.policy.family import Perceived
 from edge.policy.lpac.policy import LpacAgent
 from lpac.analysis.flight import FlightRecord
+from lpac.analysis.voronoi import coverage_cost
 from lpac.radio.airtime import TRANSPORTS, Wifi
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.batch import BatchedFlights, PolicyFailedError, fly_batch

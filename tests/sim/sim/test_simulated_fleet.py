@@ -15,18 +15,18 @@ import pytest
 
 from edge.core import F64
 from edge.core.part import PartError
-from edge.drivers.flight_log import read
 from edge.flight.failsafe import required
-from edge.flight.replay import FlightReplay
 from edge.identity.guard import Unguarded
 from edge.messages.codes import CheckCode, ReasonCode
 from edge.messages.mission import FlightState
 from edge.policy.bundle import load_bundle
 from edge.policy.lpac.policy import LpacPolicy
-from edge.policy.lpac.replay import replay
 from edge.robot.readiness import Checks
 from lpac.analysis.examination import Examined, Wanted, examine
 from lpac.analysis.flight import FlightRecord
+from lpac.analysis.flight_replay import FlightReplay
+from lpac.analysis.log_reader import read
+from lpac.analysis.policy_replay import replay
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from lpac.ground.procedure import Procedure, Until
 from lpac.ground.script import ScriptListener, ScriptRun, load_script

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge.drivers.flight_log import FlightLog, FlightLogError, topic
+from edge.drivers.flight_log import FlightLog, topic
 from lpac.analysis.arrays import Columns, log_arrays
+from lpac.analysis.log_reader import FlightLogError
 
 
 @dataclass(frozen=True)

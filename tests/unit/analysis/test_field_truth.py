@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge.core.coverage import coverage_cost
 from edge.messages.mission import Origin
 from lpac.analysis.field_truth import read_places
 from lpac.analysis.truth import TRUTH, TrueTrack, write_truth
+from lpac.analysis.voronoi import coverage_cost
 from tests.ulog import HEADER, message
 from tests.unit.analysis.test_examination import BEGAN_S, FIRST, IMPORTANCE, SCALE, Writer, examined
 

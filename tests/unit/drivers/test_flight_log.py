@@ -21,17 +21,9 @@ from msgspec import structs
 
 from edge.core.fence import Fence
 from edge.core.vehicle import Action, ActionResult, GlobalOrigin, VehicleState, Velocity
-from edge.drivers.flight_log import (
-    FlightLog,
-    FlightLogError,
-    FlightMetadata,
-    Missing,
-    read,
-    read_metadata,
-    repair,
-    topic,
-)
+from edge.drivers.flight_log import FlightLog, FlightMetadata, topic
 from edge.messages.mission import FlightState, GroundState, Order, OrderResult, Origin, Place
+from lpac.analysis.log_reader import FlightLogError, LogGap, read, read_metadata, repair
 
 METADATA = FlightMetadata(3, 77, "ab" * 32, "policies/x", '{"robot": {"id": 3}}', "0.1.0")
 NOW = 1.7e9
@@ -280,12 +272,12 @@ def test_a_file_cut_at_any_byte_is_read_up_to_there(tmp_path: Path) -> None:
     data = whole.read_bytes()
     for size in range(len(data) + 1):
         cut.write_bytes(data[:size])
-        lost: list[Missing] = []
-        found = [message["number"] for _, _, message in read(cut, missing=lost.append)]
+        lost: list[LogGap] = []
+        found = [message["number"] for _, _, message in read(cut, on_gap=lost.append)]
         # A chunk is whole before the index of its messages, which follows it.
         assert found == list(range(len(found)))
         since_s = NOW if found else None
-        assert lost == ([Missing(cut, since_s, None, damaged=False)] if size < len(data) else [])
+        assert lost == ([LogGap(cut, since_s, None, damaged=False)] if size < len(data) else [])
         assert len(found) >= sum(end <= size for end in ends)
         if size == begun:
             assert read_metadata(cut) == METADATA
@@ -307,9 +299,9 @@ def test_a_file_that_ends_in_rubbish_is_read_up_to_there(tmp_path: Path) -> None
     for rubbish in (bytes(5000), NOISE[:5000].tobytes()):
         for kept, numbers in ((len(data), [0, 1]), (len(data) - 600, [0])):
             path.write_bytes(data[:kept] + rubbish)
-            lost: list[Missing] = []
-            found = [message["number"] for _, _, message in read(path, missing=lost.append)]
-            assert found == numbers and lost == [Missing(path, NOW, None, damaged=False)]
+            lost: list[LogGap] = []
+            found = [message["number"] for _, _, message in read(path, on_gap=lost.append)]
+            assert found == numbers and lost == [LogGap(path, NOW, None, damaged=False)]
 
 
 @pytest.fixture(scope="module")
@@ -333,8 +325,8 @@ def test_a_flipped_byte_anywhere_costs_at_most_what_is_said_to_be_missing(
     data, damaged = a_flight.read_bytes(), tmp_path / "robot-3-0001.mcap"
     for at in range(len(data)):
         damaged.write_bytes(data[:at] + bytes([data[at] ^ flip]) + data[at + 1 :])
-        lost: list[Missing] = []
-        found = [message["number"] for _, _, message in read(damaged, missing=lost.append)]
+        lost: list[LogGap] = []
+        found = [message["number"] for _, _, message in read(damaged, on_gap=lost.append)]
         assert len(found) >= 3 and read_metadata(damaged) == METADATA
         for number in set(range(4)) - set(found):
             (gap,) = lost
@@ -347,11 +339,11 @@ def test_what_is_whole_of_a_damaged_log_is_repaired(a_flight: Path, tmp_path: Pa
     data, damaged, out = a_flight.read_bytes(), tmp_path / "damaged.mcap", tmp_path / "out.mcap"
     for at in (len(data) // 2, data.index(b"zstd")):  # the second has the channels
         damaged.write_bytes(data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :])
-        lost: list[Missing] = []
+        lost: list[LogGap] = []
         assert repair(damaged, out, lost.append) == 3 and len(lost) == 1
-        unsaid: list[Missing] = []
-        whole = [(name, time_s) for name, time_s, _ in read(damaged, missing=unsaid.append)]
-        assert [(name, s) for name, s, _ in read(out, missing=unsaid.append)] == whole
+        unsaid: list[LogGap] = []
+        whole = [(name, time_s) for name, time_s, _ in read(damaged, on_gap=unsaid.append)]
+        assert [(name, s) for name, s, _ in read(out, on_gap=unsaid.append)] == whole
         assert unsaid == lost and read_metadata(out) == METADATA
         with out.open("rb") as file:
             assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 3

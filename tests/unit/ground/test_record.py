@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from edge.core import F64
-from edge.core.coverage import coverage_cost
 from edge.core.fence import Fence
 from edge.core.world import parse_world, rasterize
 from edge.messages.mission import FlightState, GroundState, Origin, Place
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent, RobotSnapshot
+from lpac.analysis.voronoi import coverage_cost
 from lpac.ground.record import Recording, _line
 from lpac.ground.station.protocol import (
     ServerMessage,

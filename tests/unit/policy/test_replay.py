@@ -14,8 +14,8 @@ from edge.core.wire import PAYLOAD_TYPES, PayloadType
 from edge.policy.bundle import Bundle, BundleError
 from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
 from edge.policy.lpac.policy import LpacPolicy
-from edge.policy.lpac.replay import ReplayError, replay
 from edge.robot.pac import Pac, PacParameters
+from lpac.analysis.policy_replay import ReplayError, replay
 
 Messages = list[tuple[str, float, dict[str, Any]]]
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F32, F64, Bools
-from edge.core.coverage import local_centroid
 from edge.core.perception import PerceptionParameters, part_in_world, window_corner
+from lpac.analysis.voronoi import local_centroid
 from lpac.sim.baselines import PRIOR, Baseline, BaselineName, connected, make_baseline
 
 SIZE = 64
