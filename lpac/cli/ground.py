@@ -64,7 +64,7 @@ async def _run(
 
     def interrupt() -> None:
         now_s = time.monotonic()
-        if not process.needed() or (asked_s and now_s - asked_s[-1] < _AGAIN_S):
+        if not process.is_needed() or (asked_s and now_s - asked_s[-1] < _AGAIN_S):
             running.cancel()
             return
         asked_s.append(now_s)
@@ -76,7 +76,7 @@ async def _run(
 
     def hang_up() -> None:
         # Without its terminal it cannot ask, so it ends once no robot is in the air.
-        if process.needed():
+        if process.is_needed():
             loop.call_later(_LOOK_AGAIN_S, hang_up)
         else:
             running.cancel()

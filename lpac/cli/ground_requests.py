@@ -113,14 +113,14 @@ def measure(
     subscriber: "GroundSubscriber", robots: Sequence[str], seconds: float
 ) -> dict[str, "Standing"]:
     """Average the robots' positions and headings. Raises ValueError if one is missing."""
-    from lpac.ground.procedure import gather
+    from lpac.ground.procedure import collect_statuses
     from lpac.ground.site import standing
     from lpac.ground.station.subscriber import addressed
 
     names = addressed(subscriber.setup, robots)
     typer.echo(f"listening to {', '.join(names)} for {seconds:g} s", err=True)
     with interruptible("listening"):
-        heard = subscriber.carry_out(gather(subscriber, names, seconds))
+        heard = subscriber.carry_out(collect_statuses(subscriber, names, seconds))
     return {name: standing(name, heard[name]) for name in names}
 
 

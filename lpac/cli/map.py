@@ -86,9 +86,9 @@ def _tls(config: "FleetConfig", host: str) -> "ssl.SSLContext":
 
     from lpac.fleet.members import open_authority
     from lpac.fleet.web_certificate import web_certificate
-    from lpac.ground.map.access import reached_at
+    from lpac.ground.map.access import server_addresses
 
-    addresses = ["127.0.0.1" if a == "localhost" else a for a in reached_at(host)]
+    addresses = ["127.0.0.1" if a == "localhost" else a for a in server_addresses(host)]
     files = web_certificate(open_authority(config), addresses, datetime.datetime.now(datetime.UTC))
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.load_cert_chain(files.certificate, files.key)

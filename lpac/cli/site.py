@@ -71,14 +71,14 @@ def save(site: SiteOptions, of: OfFleet) -> None:
 
 
 def _as_it_stands(to: Addressed, site: SiteOptions) -> "SavedSite":
-    from lpac.ground.site import site_as_it_stands
+    from lpac.ground.site import measure_site
     from lpac.ground.station.subscriber import addressed
 
     with subscribe(to) as subscriber:
         names = addressed(subscriber.setup, to.robots)
         measured = {*names, *filter(None, (site.from_robot, site.toward))}
         stands = measure(subscriber, sorted(measured), site.seconds)
-        return site_as_it_stands(
+        return measure_site(
             subscriber.setup,
             subscriber.snapshot.ground,
             {robot: stands[robot] for robot in names},

@@ -48,11 +48,11 @@ def watch(
         typer.echo(json.dumps(dataclasses.asdict(snapshot)))
     elif once or not (sys.stdin.isatty() and sys.stdout.isatty()):
         from lpac.ground.alarms import alarms
-        from lpac.ground.terminal.text import all_of_it
+        from lpac.ground.terminal.text import full_view
 
         setup, snapshot = _look(name)
         width = shutil.get_terminal_size((_WIDE, 0)).columns
-        typer.echo(all_of_it(setup, snapshot, alarms(setup, snapshot), width))
+        typer.echo(full_view(setup, snapshot, alarms(setup, snapshot), width))
     else:
         from lpac.ground.terminal.app import Watch
 

@@ -396,7 +396,6 @@ def _activate(directory: str, release: str, mavlink_port: int) -> Optional[str]:
 
 
 def _install_units(directory: str, folder: str) -> None:
-    """Install the release's unit files and drop-ins."""
     # Mount point of the image in the unit.
     os.makedirs(os.path.join(directory, "sandbox"), mode=0o755, exist_ok=True)
     for unit in (UNIT, LAND_UNIT):

@@ -747,7 +747,6 @@ def _version(version: str) -> tuple[int, int]:
 
 
 def _duration(seconds: float) -> str:
-    """Duration in a unit that suits its size."""
     for limit_s, unit_s, text in ((1.0, 1e-3, "{:.0f} ms"), (120.0, 1.0, "{:.1f} s"),
                                   (172800.0, 3600.0, "{:.1f} h")):  # fmt: skip
         if seconds < limit_s:

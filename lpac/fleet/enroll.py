@@ -224,7 +224,6 @@ def _public_keys(config: FleetConfig, robot: RobotHost) -> str:
 
 
 def _ssh_options(config: FleetConfig, robot: RobotHost) -> dict[str, list[str]]:
-    """OpenSSH's options for this host, by name."""
     *command, host = ssh_command(config, robot)
     done = subprocess.run([*command, "-G", host], capture_output=True, text=True, check=False)
     if done.returncode != 0:

@@ -1,4 +1,4 @@
-"""Alarms for the operator, of all that the ground knows; nothing here has a clock."""
+"""Alarms for the operator, from the ground's snapshots. Pure."""
 
 import math
 from collections import deque
@@ -25,35 +25,34 @@ from lpac.radio.pairs import LATE_S, Blame, Link, blame
 Severity = Literal["critical", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("critical", "warning", "note")
 
-# How long ago the picture before should be.
-_BEFORE_S = 2.0
+# Age of the earlier snapshot.
+_HISTORY_S = 2.0
 
 _S = FlightState
-# Where a robot's policy has use for what others say.
-_HEARS_OTHERS = (_S.HOLD, _S.MISSION, _S.RETURN)
-# Of robots, unless their own files say otherwise.
+# States in which a robot uses the others' messages.
+_USES_OTHERS = (_S.HOLD, _S.MISSION, _S.RETURN)
+# The defaults: a robot's own configuration may differ.
 LIMITS = PreflightLimits()
-# Above the share at which a robot returns by itself: somebody may still decide.
+# Above the share at which a robot returns on its own, so that the operator can still decide.
 BATTERY_LOW = 0.3
-# A robot has heard a state by then, and said so.
+# Time for a robot to receive a state and report it.
 _OBEYED_WITHIN_S = 1.0
 FEATURE_AGE_S = 1.0
 LATE_MS = 50.0
-# Half of the rate at which robots send.
-_MESSAGE_RATE_HZ = 1.25
-# Of messages, younger than 0.8 s: with so many the field's policy still flies nearly as well. Fewer
-# than ten tell nothing of a share.
-_IN_TIME, _LEAST_SENT = 0.7, 10
-# Of a robot's wall clock, by which it writes its logs.
+# Half the rate at which robots send.
+_MIN_RATE_HZ = 1.25
+# Share of messages younger than 0.8 s with which the field's policy still flies nearly as well,
+# judged from at least ten messages.
+_MIN_IN_TIME, _MIN_SENT = 0.7, 10
+# Of the wall clock, which stamps the robot's logs.
 _CLOCK_WITHIN_S = 1.0
 _ID = 8
 _NAMES = 4
 
 
 class AlarmCode(StrEnum):
-    """Subject of an alarm."""
+    """Subject of an alarm: the fleet, or from `SILENT` on one robot."""
 
-    # The fleet.
     NOBODY_COMMANDS = "nobody_commands"
     COMMANDER_SILENT = "commander_silent"
     HELD_BY_OTHERS = "held_by_others"
@@ -62,7 +61,6 @@ class AlarmCode(StrEnum):
     INSECURE = "insecure"
     WORLD_NOT_HERE = "world_not_here"
     NOT_HEARD_YET = "not_heard_yet"
-    # One robot.
     SILENT = "silent"
     DUPLICATE_ID = "duplicate_id"
     OWN = "own"
@@ -85,7 +83,7 @@ class AlarmCode(StrEnum):
 class Alarm(NamedTuple):
     """`critical`: act now; `warning`: look into it; `note`: good to know.
 
-    `robot` is a name, "" for the fleet. What is `OWN` the robot says itself.
+    `robot` is a name, "" for the fleet. `AlarmCode.OWN` marks an alarm that the robot reports.
     """
 
     severity: Severity
@@ -97,40 +95,40 @@ class Alarm(NamedTuple):
 def alarms(
     setup: FleetSetup, snapshot: FleetSnapshot, before: FleetSnapshot | None = None
 ) -> tuple[Alarm, ...]:
-    """The alarms of a picture, the gravest first, each robot's of one kind once.
+    """Alarms of a snapshot, the gravest first, at most one per robot and code.
 
-    `before` is what `Before` gives; without it nothing is told that needs two looks: that the
-    ground's state is not obeyed, that loops miss ticks.
+    `before` is from `SnapshotHistory`; alarms that compare two snapshots (the ground's state is not
+    obeyed, loops miss ticks) need it.
     """
     fleet = _Fleet(setup, snapshot, before)
-    found = [Alarm(severity, "", code, text) for severity, code, text in _of_fleet(fleet)]
+    found = [Alarm(severity, "", code, text) for severity, code, text in _fleet_alarms(fleet)]
     found += [
         Alarm(alarm[0], seen.name, code, alarm[1])
         for code, check in _CHECKS.items()
         for seen in fleet.seen
-        if (code in _OF_THE_SILENT or seen.robot.fresh)
+        if (code in _ALSO_IF_SILENT or seen.robot.fresh)
         and (alarm := check(fleet, seen)) is not None
     ]
     return tuple(sorted(found, key=lambda alarm: SEVERITIES.index(alarm.severity)))
 
 
-class Before:
-    """Keeps the pictures of the last 2 s, as they come."""
+class SnapshotHistory:
+    """Snapshots of the last 2 s."""
 
     def __init__(self) -> None:
         self._snapshots: deque[tuple[float, FleetSnapshot]] = deque()
 
-    def take(self, snapshot: FleetSnapshot, now_s: float) -> FleetSnapshot | None:
-        """The picture of 2 s before this one, or a little more; None if there is none."""
+    def add(self, snapshot: FleetSnapshot, now_s: float) -> FleetSnapshot | None:
+        """Add a snapshot; return the one 2 s or slightly more before it, or None."""
         self._snapshots.append((now_s, snapshot))
-        while len(self._snapshots) > 1 and now_s - self._snapshots[1][0] >= _BEFORE_S:
+        while len(self._snapshots) > 1 and now_s - self._snapshots[1][0] >= _HISTORY_S:
             self._snapshots.popleft()
         at_s, before = self._snapshots[0]
-        return before if now_s - at_s >= _BEFORE_S else None
+        return before if now_s - at_s >= _HISTORY_S else None
 
 
 def is_flying(status: RobotStatus) -> bool:
-    """Whether it is in the air, or about to be, as far as its status tells."""
+    """Whether the robot is in the air or about to be, by its status."""
     handed_over = status.state is _S.PILOT and status.armed is True
     return status.state in AIRBORNE or status.in_air is True or handed_over
 
@@ -139,7 +137,7 @@ _Found = tuple[Severity, str] | None
 
 
 class _Seen(NamedTuple):
-    """A robot that was heard at some time; `before` is its status in the picture before."""
+    """A robot that was heard at some time; `before` is its status in the earlier snapshot."""
 
     robot: RobotSnapshot
     status: RobotStatus
@@ -151,7 +149,7 @@ class _Seen(NamedTuple):
 
 
 class _Fleet:
-    """A picture, and what follows from all of it. `fresh` are those that are heard now."""
+    """A snapshot, and what is derived from it as a whole. `fresh` are robots that are heard now."""
 
     def __init__(
         self, setup: FleetSetup, snapshot: FleetSnapshot, before: FleetSnapshot | None
@@ -180,62 +178,64 @@ class _Fleet:
         return self.ground is not None and self.ground.enabled_for(robot.robot_id)
 
     def _links(self) -> dict[Link, bool]:
-        """Of each two that fly within range, by names: whether the second hears the first well."""
-        flying = [seen for seen in self.fresh if seen.status.state in _HEARS_OTHERS]
+        """(sender, receiver) -> whether the link is good, of all pairs that fly within range."""
+        flying = [seen for seen in self.fresh if seen.status.state in _USES_OTHERS]
         return {
-            (said.name, heard.name): _hears_well(heard.robot, heard.status, said.robot.robot_id)
-            for heard in flying
-            for said in flying
-            if said is not heard and self._in_range(heard.status, said.status)
+            (sender.name, receiver.name): _is_good(
+                receiver.robot, receiver.status, sender.robot.robot_id
+            )
+            for receiver in flying
+            for sender in flying
+            if sender is not receiver and self._in_range(receiver.status, sender.status)
         }
 
     def _in_range(self, a: RobotStatus, b: RobotStatus) -> bool:
-        """Whether two robots are near enough to hear each other."""
         if a.position_m is None or b.position_m is None:
             return False
         range_m = self.setup.communication_range / self.setup.env_scale
         return math.dist(a.position_m[:2], b.position_m[:2]) <= range_m
 
 
-def _hears_well(robot: RobotSnapshot, status: RobotStatus, sender: int) -> bool:
-    """A robot forgets messages that are 0.8 s old; it counts them all the same."""
+def _is_good(robot: RobotSnapshot, status: RobotStatus, sender: int) -> bool:
+    """Whether the robot gets enough of the sender's messages before they are 0.8 s old."""
     key = str(sender)
     if key not in status.neighbour_ages_s:
         return False
-    if robot.rates_hz.get(key, math.inf) < _MESSAGE_RATE_HZ:
+    if robot.rates_hz.get(key, math.inf) < _MIN_RATE_HZ:
         return False
     arrivals = Arrivals.of_counts(robot.arrivals.get(key, ()))
     in_time = arrivals.arrived - arrivals.older_than(LATE_S)
-    return arrivals.sent < _LEAST_SENT or in_time >= _IN_TIME * arrivals.sent
+    return arrivals.sent < _MIN_SENT or in_time >= _MIN_IN_TIME * arrivals.sent
 
 
-def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:
+def _fleet_alarms(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:
     ground = fleet.ground
     flying = sum(is_flying(seen.status) for seen in fleet.seen)
     silent = fleet.snapshot.commander_age_s > COMMANDER_SILENT_S
     if flying and not fleet.snapshot.commander:
-        text = f"nobody commands the fleet, and {flying} fly: hold or land them"
+        verb = "flies" if flying == 1 else "fly"
+        text = f"nobody commands the fleet while {counted(flying, 'robot')} {verb}: hold or land"
         yield "critical", AlarmCode.NOBODY_COMMANDS, text
     if fleet.snapshot.commander and silent:
-        text = f"{fleet.snapshot.commander} commands, but is not heard: hold takes over"
+        text = f"the commander {fleet.snapshot.commander} is not heard: hold takes command"
         yield ("critical" if flying else "warning"), AlarmCode.COMMANDER_SILENT, text
     if fleet.setup.insecure:
-        text = "insecure: whoever is on the network can fly this fleet"
+        text = "insecure: anyone on the network can fly this fleet"
         yield "warning", AlarmCode.INSECURE, text
     if fleet.snapshot.shares_name:
-        text = f"another ground station speaks as {fleet.setup.operator}: two may command by turns"
+        text = f"another ground station uses the name {fleet.setup.operator}: both may command"
         yield "critical", AlarmCode.NAME_SHARED, text
     if fleet.snapshot.members_problem:
         yield "warning", AlarmCode.MEMBERS_DIFFER, fleet.snapshot.members_problem
     if ground is not None and ground.safety_action_by not in ("", ground.operator):
         held = [n for n, i in fleet.setup.robots.items() if ground.safety_action_for(i) == "hold"]
-        text = f"{ground.safety_action_by} asks {counted(len(held), 'robot')} to hold"
+        text = f"{ground.safety_action_by} commands {counted(len(held), 'robot')} to hold"
         yield "warning", AlarmCode.HELD_BY_OTHERS, text
     if not fleet.snapshot.commander and not flying:
         yield "note", AlarmCode.NOBODY_COMMANDS, "nobody commands the fleet yet"
     if not fleet.setup.world:
-        text = f"the robots' world {fleet.setup.world_id[:_ID]} is not here: no density, no cost"
-        yield "warning", AlarmCode.WORLD_NOT_HERE, f"{text}; `lpac mission world FILE`"
+        text = f"this station lacks the robots' world {fleet.setup.world_id[:_ID]}: no density, no "
+        yield "warning", AlarmCode.WORLD_NOT_HERE, f"{text}cost; `lpac mission world FILE`"
     if fleet.seen:
         slots = {site.robot for site in fleet.setup.slots}
         unheard = [r.name for r in fleet.snapshot.robots if r.status is None and r.name in slots]
@@ -245,21 +245,18 @@ def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:
         yield "note", AlarmCode.NOT_HEARD_YET, "no robot is heard yet"
 
 
-# Of one robot
-
-
 def _silent(fleet: _Fleet, seen: _Seen) -> _Found:
     if seen.robot.fresh:
         return None
     if is_flying(seen.status):
-        return "critical", f"not heard any more, last in the air in {seen.status.state}"
-    return "warning", f"not heard any more, last in {seen.status.state}"
+        return "critical", f"no longer heard, last in the air in {seen.status.state}"
+    return "warning", f"no longer heard, last in {seen.status.state}"
 
 
 def _duplicate(fleet: _Fleet, seen: _Seen) -> _Found:
     if not seen.robot.duplicate:
         return None
-    return "critical", "two programs say that they are this robot: end one, or revoke its key"
+    return "critical", "two programs have this robot's id: end one, or revoke its key"
 
 
 def _release(fleet: _Fleet, seen: _Seen) -> _Found:
@@ -274,35 +271,35 @@ def _own(fleet: _Fleet, seen: _Seen) -> _Found:
     status = seen.status
     if not status.alarms:
         return None
-    # What a pilot flies is in his hands, if they still move it.
+    # A pilot with a working remote control can handle it.
     has_pilot = status.state is _S.PILOT and status.remote_control is not False
     grave = is_flying(status) and not has_pilot
     return ("critical" if grave else "warning"), texts(status.alarms)
 
 
 def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
-    """Alarm if the robot has had time to obey the ground's state before, and has not."""
-    said, status = fleet.ground_before, seen.status
-    if said is None or fleet.ground is None:
+    """Robot that has had time to obey the ground's earlier state but has not."""
+    before, status = fleet.ground_before, seen.status
+    if before is None or fleet.ground is None:
         return None
-    if seen.robot.age_s is None or seen.robot.age_s > _BEFORE_S - _OBEYED_WITHIN_S:
+    if seen.robot.age_s is None or seen.robot.age_s > _HISTORY_S - _OBEYED_WITHIN_S:
         return None
     severity: Severity = "critical" if is_flying(status) else "warning"
-    if status.obeyed_sequence < said.sequence:
-        return severity, "does not obey what the ground says"
-    if status.operator not in ("", said.operator, fleet.ground.operator):
+    if status.obeyed_sequence < before.sequence:
+        return severity, "does not obey the ground's state"
+    if status.operator not in ("", before.operator, fleet.ground.operator):
         return severity, f"obeys {status.operator}, not {fleet.ground.operator}"
-    # An observer's hold, or another station, is heard here by the second picture.
+    # An observer's hold or another station would be received here by the second snapshot.
     known, obeyed = fleet.ground.sequence, status.obeyed_sequence
     if seen.before is not None and min(obeyed, seen.before.obeyed_sequence) > known:
-        return severity, f"obeys sequence {obeyed}, and the ground is at {known}"
+        return severity, f"obeys sequence {obeyed}, but the ground is at {known}"
     return None
 
 
 def _battery(fleet: _Fleet, seen: _Seen) -> _Found:
     battery = seen.status.battery
-    told = any(alarm.code in BATTERY_REASONS for alarm in seen.status.alarms)
-    if told or battery is None or battery > BATTERY_LOW:
+    reported = any(alarm.code in BATTERY_REASONS for alarm in seen.status.alarms)
+    if reported or battery is None or battery > BATTERY_LOW:
         return None
     if not is_flying(seen.status):
         return "note", f"battery low: {battery:.0%}"
@@ -320,25 +317,25 @@ def _bundle(fleet: _Fleet, seen: _Seen) -> _Found:
 
 def _world(fleet: _Fleet, seen: _Seen) -> _Found:
     theirs, ours = seen.status.world_id, fleet.world
-    if theirs == ours or _says_why(seen, WORLD_NOT_TAKEN):
+    if theirs == ours or _reports(seen, WORLD_NOT_TAKEN):
         return None
     return "warning", f"world {theirs[:_ID] or 'none'}, not the fleet's {ours[:_ID]}"
 
 
 def _origin(fleet: _Fleet, seen: _Seen) -> _Found:
-    if seen.status.origin in (None, fleet.origin) or _says_why(seen, ORIGIN_NOT_TAKEN):
+    if seen.status.origin in (None, fleet.origin) or _reports(seen, ORIGIN_NOT_TAKEN):
         return None
-    return "warning", "another origin than the fleet's"
+    return "warning", "its origin is not the fleet's"
 
 
 def _fence(fleet: _Fleet, seen: _Seen) -> _Found:
-    if seen.status.fence in (None, fleet.fence) or _says_why(seen, FENCE_NOT_TAKEN):
+    if seen.status.fence in (None, fleet.fence) or _reports(seen, FENCE_NOT_TAKEN):
         return None
-    return "warning", "another fence than the fleet's"
+    return "warning", "its fence is not the fleet's"
 
 
-def _says_why(seen: _Seen, codes: Collection[CheckCode]) -> bool:
-    """Whether it says itself that it does not take the fleet's: that is told, once."""
+def _reports(seen: _Seen, codes: Collection[CheckCode]) -> bool:
+    """Whether the robot itself reports why it has another one than the fleet."""
     return any(each.code in codes for each in seen.status.not_taken)
 
 
@@ -347,7 +344,7 @@ def _not_taken(fleet: _Fleet, seen: _Seen) -> _Found:
 
 
 def _gps(fleet: _Fleet, seen: _Seen) -> _Found:
-    """In the air; on the ground its own checks tell."""
+    """GPS in the air; on the ground the robot's own checks report it."""
     satellites, hdop = seen.status.satellites, seen.status.hdop
     if not is_flying(seen.status):
         return None
@@ -363,25 +360,24 @@ def _features(fleet: _Fleet, seen: _Seen) -> _Found:
         return None
     age_s = seen.status.feature_age_s
     if age_s is None:
-        return _graver_in_mission(seen), "has no features to ask the policy with"
+        return _graver_in_mission(seen), "has no features for its policy"
     if age_s > FEATURE_AGE_S:
         return _graver_in_mission(seen), f"features are {age_s:.1f} s old"
     return None
 
 
 def _neighbours(fleet: _Fleet, seen: _Seen) -> _Found:
-    """Alarm of senders in range that it does not hear well; of one robot's fault, it alone."""
+    """Poor links within range. A robot that explains all of its poor links is blamed alone."""
     found: Blame = fleet.blame
-    deaf, mute = seen.name in found.receivers, seen.name in found.senders
-    badly = [sender for sender, receiver in found.links if receiver == seen.name]
-    # The same words for all of them, so that a view can put them together.
-    whom = " ".join(badly) if len(badly) <= _NAMES else f"more than {_NAMES} of those in range"
-    texts_of_it = {
-        "hears nobody in range well": deaf,
-        "nobody in range hears it well": mute,
-        f"hears badly: {whom}": bool(badly),
+    poor = [sender for sender, receiver in found.links if receiver == seen.name]
+    # Beyond four names the same text for all robots, which views can group.
+    senders = " ".join(poor) if len(poor) <= _NAMES else f"more than {_NAMES} robots in range"
+    faults = {
+        "receives no robot in range well": seen.name in found.receivers,
+        "no robot in range receives it well": seen.name in found.senders,
+        f"receives badly from {senders}": bool(poor),
     }
-    text = "; ".join(text for text, holds in texts_of_it.items() if holds)
+    text = "; ".join(text for text, holds in faults.items() if holds)
     return (_graver_in_mission(seen), text) if text else None
 
 
@@ -418,7 +414,7 @@ def _graver_in_mission(seen: _Seen) -> Severity:
     return "warning" if seen.status.state is _S.MISSION else "note"
 
 
-# Within one severity, the gravest first.
+# In order of gravity within one severity.
 _CHECKS: Mapping[AlarmCode, Callable[[_Fleet, _Seen], _Found]] = {
     AlarmCode.SILENT: _silent,
     AlarmCode.DUPLICATE_ID: _duplicate,
@@ -438,5 +434,5 @@ _CHECKS: Mapping[AlarmCode, Callable[[_Fleet, _Seen], _Found]] = {
     AlarmCode.CLOCK: _clock,
     AlarmCode.NOT_READY: _not_ready,
 }
-# What a robot said long ago is no news for the others.
-_OF_THE_SILENT = (AlarmCode.SILENT, AlarmCode.DUPLICATE_ID)
+# The other checks would report old statuses.
+_ALSO_IF_SILENT = (AlarmCode.SILENT, AlarmCode.DUPLICATE_ID)

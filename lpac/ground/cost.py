@@ -1,4 +1,4 @@
-"""Coverage cost of a fleet over its missions: J, its share of J at the start, and Lloyd's J."""
+"""Coverage cost J of a fleet's missions, relative to J at the start and to Lloyd's algorithm."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -19,13 +19,13 @@ _IN_MISSION = (FlightState.MISSION, FlightState.HOLD, FlightState.PILOT)
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Cost of the robots' positions now: the paper's J, model units.
+    """Cost of the robots' present positions: the paper's J, model units.
 
-    `robots` are those that count, by name (see `lpac.analysis.coverage.LastPositions`);
-    `flying_mission` whether one of them flies its mission, which begins anew as
-    `lpac.analysis.mission_tracker` says. `initial` is J when the first of this trial did;
-    `normalized` is J over that; `bound` is what Lloyd's algorithm comes to, which
-    knows the world, with so many robots: no bound, though logs call it so. These are None before.
+    `robots` are the names of those that count (see `lpac.analysis.coverage.LastPositions`),
+    `flying_mission` whether one of them flies its mission. `initial` is J when the first robot
+    began this trial's mission (see `lpac.analysis.mission_tracker`), `normalized` is J / `initial`.
+    `bound` is the J that Lloyd's algorithm reaches with as many robots, knowing the world; it is
+    not a bound, though logs call it so. These three are None before the mission.
     """
 
     trial: str
@@ -38,10 +38,10 @@ class Cost:
 
 
 class MissionCosts:
-    """Follows a fleet's missions; pictures come in order.
+    """Tracks a fleet's missions through its snapshots, in order.
 
-    `coverage` is that of the fleet's world, None if it is not known. `began_s` is when the mission
-    of the last cost began, Unix time, None before any; `whole` whether that was seen.
+    `coverage` is that of the fleet's world, None if unknown. `began_s` is when the mission of the
+    last cost began, Unix time, None before any; `whole` whether that beginning was observed.
     """
 
     def __init__(self) -> None:
@@ -56,11 +56,11 @@ class MissionCosts:
         # J at the start of each trial's last mission.
         self._initial: dict[str, float] = {}
         self._pool = ThreadPoolExecutor(1)
-        # Of the mission that began last, by world, trial and number of robots.
+        # Of the last mission, by world, trial and number of robots.
         self._bounds: dict[tuple[str, str, int], Future[float]] = {}
 
     def take_setup(self, setup: FleetSetup) -> None:
-        """Take the fleet's world. No cost of another one can be compared with those to come."""
+        """Set the fleet's world. A new world resets the mission: costs are not comparable."""
         if setup.world != self._world:
             self.coverage = Coverage.known(setup)
             self._initial.clear()
@@ -68,15 +68,15 @@ class MissionCosts:
         self._world, self._world_id = setup.world, setup.world_id
 
     def interrupt(self) -> None:
-        """Pictures are missed: a mission may begin meanwhile."""
+        """Note that snapshots are missed, in which a mission may begin."""
         self._waited = False
 
     def close(self) -> None:
-        """Leave what is being computed."""
+        """Abandon pending computations."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def follow(self, snapshot: FleetSnapshot) -> dict[str, tuple[float, float]]:
-        """Take the next picture; the robots that count for J, and where they are, m."""
+        """Take the next snapshot; return the positions, m, of the robots that count for J."""
         if not _flies(snapshot, (FlightState.MISSION,)):
             self._waited = True
         for robot in snapshot.robots:
@@ -90,7 +90,7 @@ class MissionCosts:
         return self._last_positions.counted(snapshot)
 
     def mission_s(self, snapshot: FleetSnapshot) -> float | None:
-        """The mission time; None if none is flown now."""
+        """Time since the mission began, s; None if none is being flown."""
         if self.began_s is None or not _flies(snapshot, _IN_MISSION, self._tracker.robots):
             return None
         return max(0.0, snapshot.unix_time_s - self.began_s)
@@ -98,12 +98,12 @@ class MissionCosts:
     def cost(
         self, snapshot: FleetSnapshot, places_m: Mapping[str, tuple[float, float]], cost: float
     ) -> Cost:
-        """Judge J of at least one place, as `follow` gave them and `coverage` computes it."""
+        """Compare the J of at least one position, from `follow`, with the mission's start."""
         statuses = [
             r.status for r in snapshot.robots if r.name in places_m and r.status is not None
         ]
         flying = [status for status in statuses if status.state is FlightState.MISSION]
-        # As the robots say: a ground that has just started does not know it yet.
+        # From the robots: a ground that has just started does not know the trial yet.
         ((trial, _),) = Counter(s.trial for s in flying or statuses).most_common(1)
         if flying:
             self._initial.setdefault(trial, cost)
@@ -117,7 +117,7 @@ class MissionCosts:
         )  # fmt: skip
 
     def _bound(self, trial: str, positions_m: F64) -> float | None:
-        """Computed beside all else, once per world, trial and number; None until it is known."""
+        """Compute in a thread, once per world, trial and number; None until it is done."""
         assert self.coverage is not None
         key = self._world_id, trial, len(positions_m)
         if key not in self._bounds:
@@ -126,14 +126,14 @@ class MissionCosts:
 
 
 def positions_of(places_m: Mapping[str, tuple[float, float]]) -> F64:
-    """The places as an array (N, 2)."""
+    """Positions as an array (N, 2), m."""
     return np.array(list(places_m.values())).reshape(-1, 2)
 
 
 def _flies(
     snapshot: FleetSnapshot, states: tuple[FlightState, ...], robots: set[int] | None = None
 ) -> bool:
-    """Whether one of these robots (None: of all) is heard in one of these states."""
+    """Whether one of these robots (None: any) is fresh and in one of these states."""
     return any(
         robot.fresh and robot.status is not None and robot.status.state in states
         for robot in snapshot.robots

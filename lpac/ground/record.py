@@ -1,13 +1,13 @@
-"""The ground's log: what the ground process tells, as MCAP files `ground-<number>.mcap`.
+"""The ground's log: messages of the ground process, as MCAP files `ground-<number>.mcap`.
 
-They are flight logs (see `edge.drivers.flight_log`) with these topics, in this machine's clock:
+They are flight logs (see `edge.drivers.flight_log`) with these topics, stamped by this machine:
 
-| topic | holds |
+| topic | content |
 | --- | --- |
 | `setup` | `FleetSetup`, with the world file's text; again once a minute |
 | `state` | `GroundState`, whenever it changes |
 | `status` | `RobotStatus`, and the robot's `name`, `heard_at_unix_s`, `clock_offset_s` |
-| `event` | `GroundEvent`: commands, results, who gave them; robots' new states |
+| `event` | `GroundEvent`: commands with their operators, results; robots' new states |
 | `cost` | `Cost` |
 | `explored` | `Explored`, whenever it changes |
 """
@@ -38,7 +38,7 @@ COST_PERIOD_S = 0.5
 _SETUP_PERIOD_S = 60.0
 _SHOW_PERIOD_S = 5.0
 _RETRY_S = 0.5
-_LOOK_AGAIN_S = 0.5
+_HANG_UP_RETRY_S = 0.5
 _MAX_TOTAL_BYTES = 2**34
 
 
@@ -56,7 +56,7 @@ TOPICS = {
 
 @dataclass(frozen=True, slots=True)
 class GroundMetadata:
-    """Metadata of the ground that wrote the log."""
+    """Metadata of a ground's log."""
 
     fleet: str
     version: str
@@ -64,19 +64,19 @@ class GroundMetadata:
 
 
 class Recording:
-    """Sorts what the ground tells into topics, each thing once.
+    """Records the ground's messages by topic, each once.
 
-    `cost` is the newest. `flying` is whether a robot was in the air in the last picture.
+    `cost` is the newest cost, `flying` whether a robot was in the air in the last snapshot.
     """
 
     def __init__(self, record: Callable[[str, float, Mapping[str, object]], None]) -> None:
-        """`record` gets topic, Unix time in s, and message."""
+        """`record` gets the topic, the Unix time, s, and the message."""
         self._record = record
         self._costs = MissionCosts()
         self._setup: FleetSetup | None = None
         self._setup_at_s = 0.0
         self._state: GroundState | None = None
-        # Of each robot: boot nonce and sequence of the newest status.
+        # Boot nonce and sequence of each robot's newest status.
         self._statuses: dict[str, tuple[int, int]] = {}
         # The ground repeats its last 200 to a new client.
         self._events: deque[GroundEvent] = deque(maxlen=400)
@@ -85,22 +85,22 @@ class Recording:
         self.cost: Cost | None = None
         self.flying = False
 
-    def take(self, told: ServerMessage, unix_now_s: float) -> None:
-        """Record what is new in it."""
-        match told:
+    def take(self, message: ServerMessage, unix_now_s: float) -> None:
+        """Record what is new in a message."""
+        match message:
             case FleetSetup():
-                self._take_setup(told, unix_now_s)
+                self._take_setup(message, unix_now_s)
             case FleetSnapshot():
-                self._take_snapshot(told)
-            case GroundEvent() if told not in self._events:
-                self._events.append(told)
-                self._record("event", told.unix_time_s, dataclasses.asdict(told))
+                self._take_snapshot(message)
+            case GroundEvent() if message not in self._events:
+                self._events.append(message)
+                self._record("event", message.unix_time_s, dataclasses.asdict(message))
             case Explored(robot, cells) if self._explored.get(robot) != cells:
                 self._explored[robot] = cells
-                self._record("explored", unix_now_s, dataclasses.asdict(told))
+                self._record("explored", unix_now_s, dataclasses.asdict(message))
 
     def close(self) -> None:
-        """Leave what is being computed."""
+        """Abandon pending computations."""
         self._costs.close()
 
     def _take_setup(self, setup: FleetSetup, unix_now_s: float) -> None:
@@ -143,32 +143,31 @@ class Recording:
 def record(
     fleet: str,
     directory: Path,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     show: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Record what the ground process of `fleet` tells, until SIGINT or SIGTERM.
+    """Record the messages of the fleet's ground process until SIGINT or SIGTERM.
 
-    It waits for the ground process, also for the next when one ends. When its terminal is closed
-    (SIGHUP) it ends as `lpac ground` does: once nobody that is heard is in the air. `say` gets what
-    a person is to know; `show` where things stand, every few seconds. Raises OSError if nothing
-    can be written.
+    Waits for the ground process, and again when it ends. When the terminal closes (SIGHUP) it ends
+    as `lpac ground` does: once no robot that is heard is in the air. `notify` gets messages for the
+    user, `show` a summary every few seconds. Raises OSError if the log cannot be written.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OSError(f"{directory}: cannot be made: {in_words(error)}") from None
+        raise OSError(f"{directory}: cannot be created: {in_words(error)}") from None
     if not os.access(directory, os.W_OK | os.X_OK):
-        raise OSError(f"{directory}: nothing can be written there")
+        raise OSError(f"{directory}: is not writable")
     metadata = GroundMetadata(fleet, version("lpac-edge"))
     log = FlightLog(directory, metadata, TOPICS, max_total_bytes=_MAX_TOTAL_BYTES)
     recording = Recording(log.record)
     with contextlib.closing(recording), contextlib.closing(log):
         if not log.recording:
-            raise OSError(f"{directory}: nothing can be written there; is the disk full?")
-        say(f"recording to {directory}; Ctrl-C ends it")
-        following = _follow(fleet, log, recording, say, show)
+            raise OSError(f"{directory}: is not writable: is the disk full?")
+        notify(f"recording to {directory}; Ctrl-C ends it")
+        following = _follow(fleet, log, recording, notify, show)
         asyncio.run(_until_stopped(following, recording))
-    say(f"recorded to {directory}")
+    notify(f"recorded to {directory}")
 
 
 async def _until_stopped(following: Coroutine[None, None, None], recording: Recording) -> None:
@@ -177,13 +176,13 @@ async def _until_stopped(following: Coroutine[None, None, None], recording: Reco
 
     def hang_up() -> None:
         if recording.flying:
-            loop.call_later(_LOOK_AGAIN_S, hang_up)
+            loop.call_later(_HANG_UP_RETRY_S, hang_up)
         else:
             task.cancel()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, task.cancel)
-    # With nohup it goes on whatever becomes of the terminal.
+    # With nohup, SIGHUP is ignored.
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         loop.add_signal_handler(signal.SIGHUP, hang_up)
     with contextlib.suppress(asyncio.CancelledError):
@@ -194,41 +193,40 @@ async def _follow(
     fleet: str,
     log: FlightLog,
     recording: Recording,
-    say: Callable[[str], None],
+    notify: Callable[[str], None],
     show: Callable[[str], None],
 ) -> None:
-    hears: bool | None = None
+    connected: bool | None = None
     shown_at_s = trial = None
     while True:
         try:
-            async for told in listen(fleet):
-                if not hears:
-                    hears = True
-                    say(f"hears the ground station of fleet {fleet}")
-                recording.take(told, time.time())
-                if not isinstance(told, FleetSnapshot):
+            async for message in listen(fleet):
+                if not connected:
+                    connected = True
+                    notify(f"connected to the ground station of fleet {fleet}")
+                recording.take(message, time.time())
+                if not isinstance(message, FleetSnapshot):
                     continue
                 log.flush()
                 cost = recording.cost
                 if cost is not None and cost.flying_mission and cost.trial != trial:
                     trial = cost.trial
                     robots = counted(len(cost.robots), "robot")
-                    say(f"trial {trial or '(no name)'} begins with {robots}")
+                    notify(f"trial {trial or '(no name)'} begins with {robots}")
                 now_s = time.monotonic()
                 if shown_at_s is None or now_s - shown_at_s >= _SHOW_PERIOD_S:
                     shown_at_s = now_s
-                    show(_line(told, cost))
+                    show(_summary(message, cost))
         except (GroundError, ValueError) as error:
-            if hears is not False:
-                hears = False
-                say(f"{error}; waiting for it")
-            recording.flying = False  # as far as is known
+            if connected is not False:
+                connected = False
+                notify(f"{error}; waiting for it")
+            recording.flying = False  # unknown
             log.flush()
             await asyncio.sleep(_RETRY_S)
 
 
-def _line(snapshot: FleetSnapshot, cost: Cost | None) -> str:
-    """Status line of the recorder."""
+def _summary(snapshot: FleetSnapshot, cost: Cost | None) -> str:
     heard = sum(robot.fresh for robot in snapshot.robots)
     words = [
         time.strftime("%H:%M:%S", time.localtime(snapshot.unix_time_s)),

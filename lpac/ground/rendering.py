@@ -1,7 +1,7 @@
-"""A robot as every view shows it: words, numbers and severities, from its status and its alarms.
+"""Texts, numbers and severities of a robot, from its status and alarms, for all views.
 
-Pure. The terminal, the map's page, Foxglove and the simulator's table draw what is here, and have
-no words of their own for a robot. A text is as wide as its column at most.
+Pure. The terminal, the map's page, Foxglove and the simulator's table draw what is made here, so
+that all use the same words. A text is at most as wide as its column.
 """
 
 import math
@@ -28,7 +28,7 @@ TextStyle = Literal[
     "", "strong", "faint", "good", "calm", "busy", "foreign", "critical", "warning", "note", "bar",
     "banner",
 ]  # fmt: skip
-# Characters of an id that tell it from others.
+# Characters shown of an id.
 ID = 8
 NOT_HEARD = "not heard"
 
@@ -43,15 +43,15 @@ class Span(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A robot, and the gravest of its alarms; without a setup less can be judged."""
+    """A robot and its gravest alarm. Without a setup, limits and fence are unknown."""
 
     robot: RobotSnapshot
     alarm: Alarm | None = None
     setup: FleetSetup | None = None
 
     @property
-    def said(self) -> RobotStatus:
-        """Its newest status, of a robot that was heard at some time."""
+    def status(self) -> RobotStatus:
+        """Its newest status; only for a robot that was heard at some time."""
         assert self.robot.status is not None
         return self.robot.status
 
@@ -62,9 +62,9 @@ def in_order(
     alarms: Sequence[Alarm],
     lasting: Mapping[str, Severity] | None = None,
 ) -> list[Row]:
-    """The fleet's robots, those with critical alarms first, then those with warnings.
+    """The fleet's robots: those with critical alarms first, then those with warnings.
 
-    `lasting` are robots that are kept up for a while, so that nothing jumps to and fro.
+    `lasting` are severities that still count although the alarm is over, so that rows do not jump.
     """
     severities = {r: alarm.severity for r, alarm in gravest(alarms).items()} | dict(lasting or {})
     return sorted(
@@ -80,18 +80,15 @@ def rows(setup: FleetSetup, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) ->
 
 
 def gravest(alarms: Iterable[Alarm]) -> dict[str, Alarm]:
-    """Each robot's gravest alarm; they come in order."""
+    """Each robot's gravest alarm, from alarms in order of severity."""
     worst: dict[str, Alarm] = {}
     for alarm in alarms:
         worst.setdefault(alarm.robot, alarm)
     return worst
 
 
-# Numbers
-
-
 def number(value: float | None, width: int, decimals: int = 1) -> str:
-    """As many decimals as there is room for; "-" for what is not known, ">99" beyond the width."""
+    """Format with as many decimals as fit; "-" if unknown, ">99" if it does not fit at all."""
     if value is None or not math.isfinite(value):
         return "-".rjust(width)
     for places in range(decimals, -1, -1):
@@ -103,12 +100,12 @@ def number(value: float | None, width: int, decimals: int = 1) -> str:
 
 
 def direction(heading_deg: float, decimals: int = 0) -> str:
-    """Below 360°, also rounded."""
+    """Format a heading in [0°, 360°), also after rounding."""
     return f"{round(heading_deg, decimals) % 360.0:.{decimals}f}°"
 
 
 def age(value_s: float | None) -> str:
-    """Three characters: seconds, or with a unit minutes or hours."""
+    """Format in three characters: seconds, or minutes or hours with a unit."""
     if value_s is None or not math.isfinite(value_s):
         return "  -"
     if value_s < 9.95:
@@ -127,24 +124,24 @@ def duration(value_s: float) -> str:
 
 
 def _fence_margin_m(row: Row) -> float | None:
-    """How far inside the fence's line, negative outside; of its own fence, if it tells it."""
-    position_m, fence = row.said.position_m, row.said.fence or (row.setup and row.setup.fence)
+    """Distance inside the fence's line, m, negative outside; by the robot's own fence if known."""
+    position_m, fence = row.status.position_m, row.status.fence or (row.setup and row.setup.fence)
     if not fence or position_m is None or not all(map(math.isfinite, position_m)):
         return None
     return fence.distance_m(*position_m[:2])
 
 
 def fence_size(fence: Fence) -> str:
-    """Its extent and its heights, m."""
+    """Describe the fence's extent and heights, m."""
     across, along = zip(*fence.vertices_m, strict=True)
     sides = f"{max(across) - min(across):.0f}x{max(along) - min(along):.0f}"
     return f"{sides} m, {fence.floor_m:g}-{fence.ceiling_m:g} m high"
 
 
 def nose_rad(status: RobotStatus, heading_deg: float | None = None) -> float | None:
-    """Direction of its nose, clockwise from the mission frame's y axis; None if it is not known.
+    """Direction of its nose, clockwise from the mission frame's y axis; None if unknown.
 
-    `heading_deg` is that axis's, for a robot that has no origin yet.
+    `heading_deg` is that axis's compass heading, for a robot that has no origin yet.
     """
     own_deg = heading_deg if status.origin is None else status.origin.heading_deg
     if status.heading_rad is None or own_deg is None:
@@ -152,25 +149,22 @@ def nose_rad(status: RobotStatus, heading_deg: float | None = None) -> float | N
     return status.heading_rad - math.radians(own_deg)
 
 
-# State, and why
-
-
-class StateLook(NamedTuple):
-    """The letter and the style that stand for a state."""
+class StateStyle(NamedTuple):
+    """Letter and style of a state."""
 
     letter: str
     style: TextStyle
 
 
-_LOOKS = {
-    _S.INIT: StateLook("I", "faint"), _S.IDLE: StateLook("-", "faint"),
-    _S.PREFLIGHT: StateLook("C", ""), _S.ARMING: StateLook("A", "busy"),
-    _S.TAKEOFF: StateLook("T", "busy"), _S.HOLD: StateLook("H", "calm"),
-    _S.MISSION: StateLook("M", "good"), _S.RETURN: StateLook("R", "busy"),
-    _S.LAND: StateLook("L", "busy"), _S.LANDED: StateLook("D", "faint"),
-    _S.PILOT: StateLook("P", "foreign"), _S.FAULT: StateLook("F", "critical"),
+_STATE_STYLES = {
+    _S.INIT: StateStyle("I", "faint"), _S.IDLE: StateStyle("-", "faint"),
+    _S.PREFLIGHT: StateStyle("C", ""), _S.ARMING: StateStyle("A", "busy"),
+    _S.TAKEOFF: StateStyle("T", "busy"), _S.HOLD: StateStyle("H", "calm"),
+    _S.MISSION: StateStyle("M", "good"), _S.RETURN: StateStyle("R", "busy"),
+    _S.LAND: StateStyle("L", "busy"), _S.LANDED: StateStyle("D", "faint"),
+    _S.PILOT: StateStyle("P", "foreign"), _S.FAULT: StateStyle("F", "critical"),
 }  # fmt: skip
-_READY = StateLook("✓", "good")
+_READY = StateStyle("✓", "good")
 
 
 def is_ready(status: RobotStatus) -> bool:
@@ -183,9 +177,9 @@ def state_word(status: RobotStatus) -> str:
     return "ready" if is_ready(status) else status.state.value
 
 
-def state_look(status: RobotStatus) -> StateLook:
-    """How its state looks."""
-    return _READY if is_ready(status) else _LOOKS[status.state]
+def state_style(status: RobotStatus) -> StateStyle:
+    """Letter and style of its state."""
+    return _READY if is_ready(status) else _STATE_STYLES[status.state]
 
 
 def state_and_reason(status: RobotStatus) -> str:
@@ -194,25 +188,25 @@ def state_and_reason(status: RobotStatus) -> str:
 
 
 def missing_checks(status: RobotStatus) -> str:
-    """Checks that keep a robot in preflight from being ready, and what helps."""
+    """Failed checks of a robot in preflight, with their remedies."""
     return texts(status.failed_checks) or "the checks are still running"
 
 
 def problem(row: Row) -> Span:
-    """Text of its gravest alarm; without one, checks that fail, or the reason for its state."""
+    """Text of its gravest alarm; without one, failed checks, or the reason of its state."""
     status, alarm = row.robot.status, row.alarm
     if status is None:
         return Span("")
     if alarm is None:
         failed = status.failed_checks if status.state in ON_GROUND and not status.ready else ()
         return Span(texts(status.alarms or failed) or status.reason.text)
-    # Its state says that it is not ready.
+    # The state column already says that it is not ready.
     short = alarm.code is AlarmCode.NOT_READY
     return Span(status.failed_checks[0].text if short else alarm.text, alarm.severity)
 
 
 def not_ready(row: Row) -> str:
-    """Obstacle to its takeoff; "" if there is none."""
+    """Why it would not take off now; "" if it would."""
     status = row.robot.status
     if status is None or not row.robot.fresh:
         return NOT_HEARD
@@ -220,8 +214,6 @@ def not_ready(row: Row) -> str:
         return ""
     return missing_checks(status) if status.state is _S.PREFLIGHT else status.state.value
 
-
-# Columns
 
 MARKS: dict[Severity, str] = {"critical": "!", "warning": "*", "note": "-"}
 
@@ -242,11 +234,11 @@ def _link(row: Row) -> Span:
 
 
 def _state(row: Row) -> Span:
-    return Span(state_word(row.said), state_look(row.said).style)
+    return Span(state_word(row.status), state_style(row.status).style)
 
 
 def _battery(row: Row) -> Span:
-    battery = row.said.battery
+    battery = row.status.battery
     if battery is None:
         return Span("-")
     style: TextStyle = "warning" if battery <= BATTERY_LOW else ""
@@ -256,13 +248,13 @@ def _battery(row: Row) -> Span:
 
 
 def _satellites(row: Row) -> Span:
-    satellites = row.said.satellites
+    satellites = row.status.satellites
     few = satellites is not None and satellites < LIMITS.min_satellites
     return Span(number(satellites, 3, 0), "warning" if few else "")
 
 
 def _coordinate(axis: int, width: int) -> Callable[[Row], Span]:
-    return lambda row: Span(number(row.said.position_m and row.said.position_m[axis], width))
+    return lambda row: Span(number(row.status.position_m and row.status.position_m[axis], width))
 
 
 def speed_m_s(status: RobotStatus) -> float | None:
@@ -271,25 +263,25 @@ def speed_m_s(status: RobotStatus) -> float | None:
 
 
 def _features(row: Row) -> Span:
-    age_s = row.said.feature_age_s
-    old = age_s is not None and age_s > FEATURE_AGE_S and row.said.state in (_S.HOLD, _S.MISSION)
+    age_s = row.status.feature_age_s
+    old = age_s is not None and age_s > FEATURE_AGE_S and row.status.state in (_S.HOLD, _S.MISSION)
     return Span(age(age_s), "warning" if old else "")
 
 
 def _rate(row: Row) -> Span:
-    heard = row.said.neighbour_ages_s
+    heard = row.status.neighbour_ages_s
     rates_hz = [rate for robot, rate in row.robot.rates_hz.items() if robot in heard]
     return Span(number(sum(rates_hz) / len(rates_hz) if rates_hz else None, 3))
 
 
 def _oldest(row: Row) -> Span:
-    return Span(age(max(row.said.neighbour_ages_s.values(), default=None)))
+    return Span(age(max(row.status.neighbour_ages_s.values(), default=None)))
 
 
 def _lag(row: Row) -> Span:
-    lag_ms = max((loop.lateness_p99_ms for loop in row.said.loops.values()), default=None)
+    lag_ms = max((loop.lateness_p99_ms for loop in row.status.loops.values()), default=None)
     late = lag_ms is not None and lag_ms > LATE_MS
-    # Beyond a second with the unit, as an age has one beyond minutes.
+    # From a second on, in seconds with the unit.
     if lag_ms is not None and lag_ms >= 999.5:
         return Span(number(lag_ms / 1000.0, 2, 0) + "s", "warning")
     return Span(number(lag_ms, 3), "warning" if late else "")
@@ -301,7 +293,7 @@ def _margin(row: Row) -> Span:
 
 
 class Column(NamedTuple):
-    """`top` and `unit` head it; where there is not room for all columns, low ranks stay."""
+    """Column headed by `top` and `unit`. Where not all fit, those of low rank are shown."""
 
     key: str
     rank: int
@@ -312,44 +304,44 @@ class Column(NamedTuple):
     left: bool = False
 
 
-# Left to right. At 80 columns, one of them for the scroll bar, ranks up to 8 have room: who reads
-# why a robot is as it is sees where it is on the map.
+# Left to right. On 80 characters, one of them the scroll bar, ranks up to 8 fit; positions are on
+# the map.
 COLUMNS = (
     Column("mark", 0, "", "", 1, _mark, left=True),
     Column("name", 1, "name", "", 4, _name, left=True),
     Column("state", 2, "state", "", 9, _state, left=True),
     Column("battery", 5, "bat", "%", 3, _battery),
     Column("satellites", 8, "GPS", "sat", 3, _satellites),
-    Column("mode", 6, "mode", "", 8, lambda row: Span(row.said.mode or "-"), left=True),
+    Column("mode", 6, "mode", "", 8, lambda row: Span(row.status.mode or "-"), left=True),
     Column("x", 9, "x", "m", 5, _coordinate(0, 5)),
     Column("y", 10, "y", "m", 5, _coordinate(1, 5)),
     Column("height", 7, "h", "m", 4, _coordinate(2, 4)),
-    Column("speed", 16, "v", "m/s", 3, lambda row: Span(number(speed_m_s(row.said), 3))),
+    Column("speed", 16, "v", "m/s", 3, lambda row: Span(number(speed_m_s(row.status), 3))),
     Column("features", 11, "feat", "s", 4, _features),
-    Column("neighbours", 12, "neigh", "n", 5, lambda r: Span(str(len(r.said.neighbour_ages_s)))),
+    Column("neighbours", 12, "neigh", "n", 5, lambda r: Span(str(len(r.status.neighbour_ages_s)))),
     Column("rate", 14, "", "Hz", 3, _rate),
     Column("oldest", 13, "", "s", 3, _oldest),
     Column("lag", 15, "lag", "ms", 3, _lag),
     Column("link", 3, "link", "s", 4, _link),
     Column("margin", 17, "fence", "m", 5, _margin),
-    Column("bundle", 18, "bundle", "", ID, lambda row: Span(row.said.bundle_id[:ID]), left=True),
-    Column("world", 19, "world", "", ID, lambda row: Span(row.said.world_id[:ID]), left=True),
+    Column("bundle", 18, "bundle", "", ID, lambda row: Span(row.status.bundle_id[:ID]), left=True),
+    Column("world", 19, "world", "", ID, lambda row: Span(row.status.world_id[:ID]), left=True),
     Column("problem", 4, "reason", "", 30, problem, left=True),
 )
 COLUMN = {column.key: column for column in COLUMNS}
-# These are also of a robot that is not heard.
-_OF_ROBOT = ("mark", "name", "link", "problem")
+# Columns of a robot that was never heard, too.
+_ALWAYS = ("mark", "name", "link", "problem")
 
 
 def cell(row: Row, column: str) -> Span:
-    """One of a row's cells. What was said long ago is faint."""
+    """Cell of a row. Values of an old status are faint."""
     text, style = _cell(row, column)
-    old = column not in _OF_ROBOT and not row.robot.fresh
+    old = column not in _ALWAYS and not row.robot.fresh
     return Span(text, "faint" if old else style)
 
 
 def quantity(row: Row, column: str) -> Span:
-    """A cell with its unit, where no heading has it, however old it is. Counts have none."""
+    """Cell with its unit, for use without a heading, not faint. Counts have no unit."""
     text, style = _cell(row, column)
     text, unit = text.strip(), COLUMN[column].unit
     counts = unit in ("", "n", "sat")
@@ -357,16 +349,13 @@ def quantity(row: Row, column: str) -> Span:
 
 
 def _cell(row: Row, column: str) -> Span:
-    if row.robot.status is None and column not in _OF_ROBOT:
+    if row.robot.status is None and column not in _ALWAYS:
         return Span(NOT_HEARD if column == "state" else "-", "faint")
     return COLUMN[column].of(row)
 
 
-# All of a robot
-
-
 class Fact(NamedTuple):
-    """Something that is known of a robot; some are of the same name."""
+    """Something known of a robot. Several facts may share a name."""
 
     name: str
     text: str
@@ -374,16 +363,16 @@ class Fact(NamedTuple):
 
 
 def facts(row: Row, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) -> list[Fact]:
-    """All that is known of a robot, but for the `tables`: first what is wrong."""
+    """All that is known of a robot except the `tables`; problems first."""
     robot, status = row.robot, row.robot.status
-    told = [Fact("alarm", a.text, a.severity) for a in alarms if a.robot == robot.name]
+    known = [Fact("alarm", a.text, a.severity) for a in alarms if a.robot == robot.name]
     if status is None:
-        return [*told, Fact("", "it was never heard", "faint")]
-    told += [Fact("not taken", each.text, "warning") for each in status.not_taken]
+        return [*known, Fact("", "never heard", "faint")]
+    known += [Fact("not taken", each.text, "warning") for each in status.not_taken]
     if status.state in ON_GROUND:
-        told += [Fact("not ready", check.text) for check in status.failed_checks]
+        known += [Fact("not ready", check.text) for check in status.failed_checks]
     more = _flight(status) | _program(row, status, snapshot.ground)
-    return told + [Fact(name, text) for name, text in more.items() if text]
+    return known + [Fact(name, text) for name, text in more.items() if text]
 
 
 def _flight(status: RobotStatus) -> dict[str, str]:
@@ -393,27 +382,27 @@ def _flight(status: RobotStatus) -> dict[str, str]:
     if status.position_m is not None:
         x_m, y_m, height_m = status.position_m
         where = f"x {x_m:.1f}, y {y_m:.1f}, height {height_m:.1f} of {status.slot_height_m:g} m"
-    lasts = _told("for {:.0f} s", status.battery_lasts_s)
+    lasts = _format("for {:.0f} s", status.battery_lasts_s)
     heading_rad = status.heading_rad
     return {
-        "vehicle": _listed(
+        "vehicle": _joined(
             status.mode or "mode unknown",
             armed[status.armed],
             air[status.in_air],
-            _told("battery {:.0%}", status.battery),
-            lasts and lasts + _told(" of which home takes {:.0f}", status.home_s),
-            _told("system id {}", status.system_id),
+            _format("battery {:.0%}", status.battery),
+            lasts and lasts + _format(" of which home takes {:.0f}", status.home_s),
+            _format("system id {}", status.system_id),
         ),
-        "GPS": _listed(
+        "GPS": _joined(
             "" if status.satellites is None else counted(status.satellites, "satellite"),
-            _told("HDOP {:.1f}", status.hdop),
-            _told("accurate to {:.1f} m", status.gps_accuracy_m),
-            _told("at {0[0]:.6f} {0[1]:.6f}", status.global_deg),
+            _format("HDOP {:.1f}", status.hdop),
+            _format("accurate to {:.1f} m", status.gps_accuracy_m),
+            _format("at {0[0]:.6f} {0[1]:.6f}", status.global_deg),
         ),
-        "position": _listed(
+        "position": _joined(
             where,
-            _told("position {}", status.position_quality),
-            _told("{:.1f} m/s", speed_m_s(status)),
+            _format("position {}", status.position_quality),
+            _format("{:.1f} m/s", speed_m_s(status)),
             "" if heading_rad is None else f"heading {direction(math.degrees(heading_rad))}",
         ),
     }
@@ -426,11 +415,12 @@ def _program(row: Row, status: RobotStatus, ground: GroundState | None) -> dict[
     safety_action = "none" if ground is None else ground.safety_action_for(status.robot_id)
     return {
         "landing": f"at x {x_m:.1f} m, y {y_m:.1f} m"
-        + _told(", {:.1f} m away", away_m)
-        + _told("; fence margin {:.1f} m", _fence_margin_m(row)),
-        "policy": _listed(
-            _told("asks for {0[0]:.2f} {0[1]:.2f} m/s", status.policy_velocity_m_s) or "no answer",
-            _told("features {:.1f} s old", status.feature_age_s) or "no features",
+        + _format(", {:.1f} m away", away_m)
+        + _format("; fence margin {:.1f} m", _fence_margin_m(row)),
+        "policy": _joined(
+            _format("asks for {0[0]:.2f} {0[1]:.2f} m/s", status.policy_velocity_m_s)
+            or "no answer",
+            _format("features {:.1f} s old", status.feature_age_s) or "no features",
             status.trial and f"trial {status.trial}",
         ),
         "obeys": f"{status.operator}, state {status.obeyed_sequence}"
@@ -442,31 +432,31 @@ def _program(row: Row, status: RobotStatus, ground: GroundState | None) -> dict[
             "accepted" if order.refusal is None else f"refused: {order.refusal.text}"
             for order in reversed(status.orders)
         ),
-        "release": _listed(
+        "release": _joined(
             f"bundle {status.bundle_id[:ID]}",
             f"world {status.world_id[:ID]}",
-            _told("fence {}", status.fence and fence_size(status.fence)),
+            _format("fence {}", status.fence and fence_size(status.fence)),
         ),
         "origin": ""
         if origin is None
         else f"{origin.latitude_deg:.7f} {origin.longitude_deg:.7f} "
         f"{direction(origin.heading_deg, 1)}",
         "program": f"up {duration(status.uptime_s)}, start {status.boot_nonce:x}"
-        + _told(", clock {:+.2f} s", row.robot.clock_offset_s),
+        + _format(", clock {:+.2f} s", row.robot.clock_offset_s),
     }
 
 
-def _told(text: str, value: object) -> str:
-    """The text with that value, if it is known."""
+def _format(text: str, value: object) -> str:
+    """Format the value; "" if it is None."""
     return "" if value is None else text.format(value)
 
 
-def _listed(*parts: str | None) -> str:
+def _joined(*parts: str | None) -> str:
     return ", ".join(part for part in parts if part)
 
 
 class StatusTable(NamedTuple):
-    """A table of a robot's status: headings, the width of each column, and rows in one style."""
+    """Table of a robot's status: headings, column widths, and rows of one style each."""
 
     headings: tuple[str, ...]
     widths: tuple[int, ...]
@@ -474,10 +464,9 @@ class StatusTable(NamedTuple):
 
 
 def tables(row: Row) -> tuple[StatusTable, ...]:
-    """Neighbours: count, rate and age of their messages. Loops: ticks, and lateness in ms.
+    """Tables of neighbours (count, rate, Hz, and age, s, of messages) and loops (lateness, ms).
 
-    Below the neighbours is what became of messages that were not taken; lateness is of the last
-    minute.
+    Below the neighbours are the counts of rejected messages. Lateness is of the last minute.
     """
     status = row.robot.status
     if status is None:
@@ -489,8 +478,8 @@ def tables(row: Row) -> tuple[StatusTable, ...]:
         count = number(status.neighbour_messages.get(robot), 8, 0)
         rate = number(row.robot.rates_hz.get(robot), 4)
         cells = names.get(robot, f"robot {robot}"), count, rate
-        heard_s = status.neighbour_ages_s.get(robot)
-        neighbours.append(((*cells, age(heard_s)), "" if heard_s is not None else "faint"))
+        age_s = status.neighbour_ages_s.get(robot)
+        neighbours.append(((*cells, age(age_s)), "" if age_s is not None else "faint"))
     for why, messages in status.message_counts.items():
         if why != "accepted" and messages:
             neighbours.append(((why, number(messages, 8, 0)), "faint"))

@@ -1,7 +1,7 @@
-"""A script of trials, such as the paper's experiment: its file, and flying it.
+"""Scripts of trials, such as the paper's experiment: the file format, and the procedure.
 
-docs/script.toml has every key. What a script does are commands of the ground, like anybody's; it
-sees of the robots what the ground tells. Whoever holds the fleet meanwhile has it: the script ends.
+docs/script.toml has every key. A script is an ordinary client of the ground: it gives commands and
+reads snapshots. It ends when another operator commands the fleet to hold, return or land.
 """
 
 import math
@@ -20,7 +20,7 @@ from edge.core.toml import read_toml
 from edge.core.world import has_importance, parse_world
 from edge.messages.mission import FlightState, GroundState, Heading, Origin, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
-from lpac.ground.procedure import Ground, Procedure, Until, fresh_snapshot, gather
+from lpac.ground.procedure import Ground, Procedure, Until, collect_statuses, fresh_snapshot
 from lpac.ground.rendering import NOT_HEARD, missing_checks, state_and_reason
 from lpac.ground.site import SavedSite, Sites, origin_at, places_at, standing
 from lpac.ground.station.protocol import (
@@ -45,23 +45,21 @@ from lpac.ground.station.subscriber import addressed
 
 _S = FlightState
 
-# Where checks are still to come, or to settle.
+# States in which checks may still be running or settling.
 _BEFORE_READY = (_S.INIT, _S.IDLE, _S.PREFLIGHT)
-_START_AGAIN_S = 3.0
-# So long a start may take: nothing else of the script may be due meanwhile.
-_START_TAKES_S = 7.0
-_REJOIN_WITHIN_S = 15.0
+_RESTART_PERIOD_S = 3.0
+# Longest duration of a start, in which no other step may be due.
+_MAX_START_S = 7.0
+_REJOIN_TIMEOUT_S = 15.0
 _PERIOD_S = 0.2
-# What is due in less, by rounding, would never come on a clock that is counted.
-_LEAST_S = 0.01
+# A shorter wait, from rounding, would not advance a simulated clock.
+_MIN_WAIT_S = 0.01
 _Duration = Annotated[float, Meta(gt=0.0, le=36000.0)]
-
-# The file
 
 
 @dataclass(frozen=True, slots=True)
 class OriginStep(Bounded):
-    """Set the mission's origin: as given, or as `lpac mission origin --from` measures it."""
+    """Set the mission's origin: as given, or measured as by `lpac mission origin --from`."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
@@ -75,7 +73,7 @@ class OriginStep(Bounded):
         if self.from_robot and given != (None, None, None):
             raise ValueError(
                 "from_robot: measures the origin: latitude_deg, longitude_deg and heading_deg must "
-                "not be given too"
+                "be left out"
             )
         if not self.from_robot and (None in given or self.toward_robot):
             raise ValueError(
@@ -83,7 +81,7 @@ class OriginStep(Bounded):
             )
 
     def given(self) -> Origin | None:
-        """The origin as it is written; None if it is to be measured."""
+        """The given origin; None if it is to be measured."""
         if self.latitude_deg is None or self.longitude_deg is None or self.heading_deg is None:
             return None
         return Origin(self.latitude_deg, self.longitude_deg, self.heading_deg)
@@ -91,21 +89,21 @@ class OriginStep(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class SiteStep:
-    """Use a saved site: origin, fence, landing points."""
+    """Use a saved site: its origin, fence and landing points."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class WorldStep:
-    """Send a world file, relative to the script's folder, to the robots."""
+    """Send a world file to the robots; its path is relative to the script's folder."""
 
     file: str
 
 
 @dataclass(frozen=True, slots=True)
 class PreflightStep(Bounded):
-    """Enable the robots, and wait until all are ready."""
+    """Enable the robots and wait until all are ready."""
 
     at_most_s: _Duration = 60.0
 
@@ -120,7 +118,7 @@ class TakeoffStep(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class Perturbation(Bounded):
-    """At that time of the mission, give a robot to a pilot, or take it back into the mission."""
+    """Hand a robot to a pilot at a time of the mission, or take it back into the mission."""
 
     at_s: NonNegative
     robot: str
@@ -129,7 +127,7 @@ class Perturbation(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class MissionStep(Bounded):
-    """Fly the mission; `restart`: robots that come to hold by themselves are started again."""
+    """Fly the mission; with `restart`, robots that hold on their own are started again."""
 
     duration_s: _Duration
     restart: bool = False
@@ -142,14 +140,14 @@ class MissionStep(Bounded):
                     f"perturb: at_s = {perturbation.at_s}: must be below duration_s = "
                     f"{self.duration_s}"
                 )
-        given: set[str] = set()
+        piloted: set[str] = set()
         for perturbation in self.in_time():
             at = f"perturb: at_s = {perturbation.at_s}: {perturbation.robot}"
-            if perturbation.do == "pilot" and perturbation.robot in given:
-                raise ValueError(f"{at} has a pilot already: must rejoin before")
-            if perturbation.do == "rejoin" and perturbation.robot not in given:
-                raise ValueError(f"{at} has no pilot: must be given to one before it rejoins")
-            given ^= {perturbation.robot}
+            if perturbation.do == "pilot" and perturbation.robot in piloted:
+                raise ValueError(f"{at} has a pilot already: must rejoin first")
+            if perturbation.do == "rejoin" and perturbation.robot not in piloted:
+                raise ValueError(f"{at} has no pilot: must be handed to one before it rejoins")
+            piloted ^= {perturbation.robot}
 
     def in_time(self) -> list[Perturbation]:
         """Perturbations in order of time."""
@@ -158,12 +156,12 @@ class MissionStep(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class ReturnStep:
-    """Fly to the landing points and land; done when all have."""
+    """Fly to the landing points and land; done when all have landed."""
 
 
 @dataclass(frozen=True, slots=True)
 class LandStep:
-    """Land where the robots are; done when all have."""
+    """Land in place; done when all have landed."""
 
 
 Step = (
@@ -181,7 +179,7 @@ _NAMES = {kind: name for name, kind in (STEPS_BEFORE | STEPS).items()}
 
 @dataclass(frozen=True, slots=True)
 class ScriptTable(Bounded):
-    """The file as it is written."""
+    """The whole file."""
 
     trial: Annotated[
         str,
@@ -201,9 +199,9 @@ class ScriptTable(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class Script:
-    """A script that can be flown as far as its file tells.
+    """A checked script. `before` runs once, `steps` in each of `trials`.
 
-    `before` happens once, `steps` in each of `trials`. `robots` empty: all that sit in a slot.
+    `robots` is empty for all robots with a slot.
     """
 
     path: Path
@@ -215,9 +213,9 @@ class Script:
 
 
 def load_script(path: Path, sites: Sites) -> Script:
-    """Raises ValueError, one line that names the file, the step, the key and what is allowed.
+    """Load a script, checking its worlds and sites too.
 
-    Looks into the worlds and sites that the script will need, too.
+    Raises ValueError: one line that names the file, the step, the key and what is allowed.
     """
     table = from_mapping(ScriptTable, read_toml(path), str(path))
     before = _steps(table.before, STEPS_BEFORE, f"{path}: before")
@@ -232,15 +230,15 @@ def load_script(path: Path, sites: Sites) -> Script:
 
 
 def read_world(path: Path) -> str:
-    """The text of a world file. Raises ConfigError that names the file and what is wrong in it."""
+    """Read and check a world file. Raises ConfigError that names the file and the error."""
     try:
         text = path.read_text("utf-8-sig")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: no text: {error}") from None
+        raise ConfigError(f"{path}: not text: {error}") from None
     if not has_importance(parse_world(text, str(path))):
-        raise ConfigError(f"{path}: holds no features of any importance")
+        raise ConfigError(f"{path}: has no features of any importance")
     return text
 
 
@@ -264,7 +262,7 @@ def _steps(
 
 
 def _check_order(steps: Sequence[Step], where: str) -> None:
-    """A trial begins on the ground and ends there, with one mission between takeoff and landing."""
+    """Require that a trial begins and ends on the ground, with one mission per flight."""
     in_air = flown = False
     for i, step in enumerate(steps):
         at = f"{where}[{i}] ({_NAMES[type(step)]})"
@@ -286,28 +284,25 @@ def _check_order(steps: Sequence[Step], where: str) -> None:
         raise ConfigError(f"{where}: the last step is {last!r}: must be 'return' or 'land'")
 
 
-# Flying it
-
-
 class ScriptListener(Protocol):
     """Listener to the progress of a script."""
 
     def step(self, name: str, at_most_s: float | None) -> None:
-        """A step begins; it takes so long, or as long as it takes."""
+        """Begin a step that takes at most `at_most_s`; None if that is not limited."""
 
     def line(self, text: str) -> None:
-        """Something happened that is worth a line."""
+        """Show a line about an event."""
 
-    def may(self, question: str) -> bool:
-        """Whether a person lets the script go on."""
+    def confirm(self, question: str) -> bool:
+        """Ask a person whether to go on."""
         ...
 
 
 class ScriptError(RuntimeError):
-    """A step failed; the text says which and why.
+    """A failed step; the message says which and why.
 
-    `hold`: whoever flies is to be held. Not so if somebody else commands the fleet to hold, return
-    or land, or robots are on their way to the ground.
+    `hold`: robots in flight should be held. False if another operator commands the fleet to hold,
+    return or land, or robots are landing.
     """
 
     def __init__(self, text: str, *, hold: bool = True) -> None:
@@ -316,11 +311,10 @@ class ScriptError(RuntimeError):
 
 
 class ScriptRun:
-    """One run of a script. `robots` are those that it addresses, `given` whom a pilot has by it.
+    """One run of a script, for `robots`; those that it has handed to a pilot are in `piloted`.
 
-    `mission_ends` may be set: the mission is over then, and the next step comes; nobody takes off.
-
-    `fly` and `hold` are procedures: whoever has the ground carries them out.
+    Set `mission_ends` to end the mission early and go on with the next step, without further
+    takeoffs. `fly` and `hold` are procedures (see `lpac.ground.procedure`).
     """
 
     def __init__(
@@ -333,68 +327,68 @@ class ScriptRun:
                 for name in _names(step):
                     addressed(ground.setup, [name])
                     if isinstance(step, MissionStep) and name not in self.robots:
-                        raise ValueError(f"perturb: robot {name!r} is none of the script's robots")
+                        raise ValueError(
+                            f"perturb: robot {name!r} is not among the script's robots"
+                        )
         except ValueError as error:
             raise ConfigError(f"{script.path}: {error}") from None
         self._script = script
         self._sites = sites
         self._ground = ground
         self._listener = listener
-        self.given: set[str] = set()
+        self.piloted: set[str] = set()
         self.mission_ends = False
-        self._said: set[Hashable] = set()
+        self._reported: set[Hashable] = set()
         self._last_start_s: dict[str, float] = {}
 
     def fly(self) -> Procedure[None]:
-        """Go through all steps of all trials. Raises ScriptError.
+        """Run all steps of all trials. Raises ScriptError.
 
-        What flies then flies on: call `hold`, also after a KeyboardInterrupt.
+        Robots in flight then fly on: call `hold`, also after a KeyboardInterrupt.
         """
         script = self._script
         for i, step in enumerate(script.before):
-            yield from self._go(step, f"before[{i}]", "")
+            yield from self._run_step(step, f"before[{i}]", "")
         first = self._first_number()
         for trial in range(1, script.trials + 1):
             count = f"trial {trial} of {script.trials}: " if script.trials > 1 else ""
-            self._said.clear()
-            self.given.clear()
-            if trial > 1 and not self._listener.may(f"{count}let the robots take off again?"):
-                raise ScriptError(f"{count}not wanted", hold=False)
+            self._reported.clear()
+            self.piloted.clear()
+            if trial > 1 and not self._listener.confirm(f"{count}let the robots take off again?"):
+                raise ScriptError(f"{count}declined", hold=False)
             yield from self._begin_trial(first + trial - 1, count)
             for i, step in enumerate(script.steps):
-                yield from self._go(step, f"steps[{i}]", count)
+                yield from self._run_step(step, f"steps[{i}]", count)
 
     def hold(self) -> Procedure[str]:
-        """Hold whoever flies; what came of it, and what to do next, in words."""
-        # Who is not heard just now may well be.
+        """Hold robots in flight; return the result and what to do next, in words."""
+        # With old statuses too: a robot that is silent now may be in the air.
         last = [r.status for r in self._ground.snapshot.robots if r.name in self.robots]
         if all(status is None or is_down(status) for status in last):
-            return "nobody is in the air"
+            return "no robot is in the air"
         report = yield SafetyCommand("hold", self._script.robots)
-        told = "the fleet is told to hold"
+        done = "hold is commanded"
         if not report.done:
-            told += f", but {failures(report)}"
-        return f"{told}: next `lpac mission land`, `lpac mission return`, or `lpac mission resume`"
+            done += f", but {failures(report)}"
+        return f"{done}: next `lpac mission land`, `lpac mission return` or `lpac mission resume`"
 
-    # Steps
-
-    def _go(self, step: Step, where: str, count: str) -> Procedure[None]:
+    def _run_step(self, step: Step, where: str, count: str) -> Procedure[None]:
         name = f"{count}{_NAMES[type(step)]}"
         try:
             if self.mission_ends and isinstance(step, TakeoffStep):
                 raise ScriptError("stopped", hold=False)
             if isinstance(step, MissionStep):
-                # Its time counts from when all fly it.
+                # The mission's time counts from when all robots fly it.
                 self._listener.step(f"{count}start", None)
                 yield from self._require_of_flying(Start(self._script.robots))
             self._listener.step(name, _duration_s(step))
-            yield from self._do(step)
+            yield from self._execute(step)
         except ScriptError as error:
             raise ScriptError(f"{name} ({where}): {error}", hold=error.hold) from None
         except ValueError as error:
             raise ScriptError(f"{name} ({where}): {error}") from None
 
-    def _do(self, step: Step) -> Procedure[None]:
+    def _execute(self, step: Step) -> Procedure[None]:
         robots = self._script.robots
         match step:
             case OriginStep():
@@ -414,12 +408,12 @@ class ScriptRun:
             case MissionStep():
                 yield from self._fly_mission(step)
             case ReturnStep():
-                yield from self._bring_down(SafetyCommand("return", robots, wait=True))
+                yield from self._land_all(SafetyCommand("return", robots, wait=True))
             case LandStep():
-                yield from self._bring_down(SafetyCommand("land", robots, wait=True))
+                yield from self._land_all(SafetyCommand("land", robots, wait=True))
 
     def _first_number(self) -> int:
-        """Of the first trial's name: a script that is run again numbers on."""
+        """Number of the first trial: a repeated script continues the numbering."""
         ground = self._ground.snapshot.ground
         name = re.escape(self._script.trial)
         match = re.fullmatch(rf"{name}-(\d{{1,6}})", "" if ground is None else ground.trial)
@@ -437,8 +431,8 @@ class ScriptRun:
     def _set_origin(self, step: OriginStep) -> Procedure[None]:
         origin = step.given()
         if origin is None:
-            heard = yield from gather(self._ground, _names(step), step.average_s)
-            stands = [standing(name, statuses) for name, statuses in heard.items()]
+            found = yield from collect_statuses(self._ground, _names(step), step.average_s)
+            stands = [standing(name, statuses) for name, statuses in found.items()]
             origin = origin_at(stands[0], stands[1] if len(stands) > 1 else None)
         self._listener.line(
             f"origin {origin.latitude_deg:.7f} {origin.longitude_deg:.7f}, heading "
@@ -451,24 +445,24 @@ class ScriptRun:
         if ground and any(
             ground.safety_action_for(ids[r]) in ("return", "land") for r in self.robots
         ):
-            # The last trial's end, which keeps robots from flying again.
+            # Withdraw the end of the last trial, which keeps robots on the ground.
             yield from self._require(Resume(self._script.robots))
         began_s = self._ground.now_s
         report = yield Enable(True, self._script.robots)
         snapshot = yield from fresh_snapshot(self._ground)
         statuses = self._statuses(snapshot)
-        late = {r.robot for r in report.results if not r.done}
+        not_yet = {r.robot for r in report.results if not r.done}
         if report.problem or not all(
-            n in statuses and statuses[n].state in _BEFORE_READY for n in late
+            n in statuses and statuses[n].state in _BEFORE_READY for n in not_yet
         ):
             raise ScriptError(failures(report))
 
         def ready(snapshot: FleetSnapshot) -> bool:
             missing = self._not_ready(snapshot)
-            # At first everything is missing.
+            # At first all checks fail.
             if self._ground.now_s - began_s > min(5.0, step.at_most_s / 2.0):
                 for what, text in missing.items():
-                    self._say_once(what, text)
+                    self._report_once(what, text)
             return not missing
 
         left_s = began_s + step.at_most_s - self._ground.now_s
@@ -479,17 +473,17 @@ class ScriptRun:
             )
 
     def _not_ready(self, snapshot: FleetSnapshot) -> dict[Hashable, str]:
-        """Obstacles to takeoff, in words, by what each is."""
+        """Why robots are not ready, in words; the key identifies each reason."""
         missing: dict[Hashable, str] = {}
         statuses, ground = self._statuses(snapshot), snapshot.ground
         for name in self.robots:
             status = statuses.get(name)
-            asked = ground.safety_action_for(status.robot_id) if ground and status else "none"
+            action = ground.safety_action_for(status.robot_id) if ground and status else "none"
             if status is None:
                 missing[name, NOT_HEARD] = f"{name} is {NOT_HEARD}"
-            elif asked != "none":
-                text = f"{name} is told to {asked}: withdraw it by `lpac mission resume`"
-                missing[name, asked] = text
+            elif action != "none":
+                text = f"{name} is commanded to {action}: `lpac mission resume` withdraws it"
+                missing[name, action] = text
             elif status.state is not _S.PREFLIGHT:
                 text = f"{name} is in {state_and_reason(status)}"
                 missing[name, status.state, status.reason.code] = text
@@ -498,21 +492,19 @@ class ScriptRun:
                 missing[name, *codes] = f"{name}: {missing_checks(status)}"
         return missing
 
-    def _bring_down(self, request: SafetyCommand) -> Procedure[None]:
+    def _land_all(self, request: SafetyCommand) -> Procedure[None]:
         report = yield request
         if not report.done:
-            # Held, those that land already would stay in the air.
+            # A hold would keep landing robots in the air.
             raise ScriptError(failures(report), hold=False)
 
-    # The mission
-
     def _fly_mission(self, step: MissionStep) -> Procedure[None]:
-        # An older picture may show robots that have not started yet.
+        # An older snapshot may show robots before their start.
         yield from fresh_snapshot(self._ground)
         began_s = self._ground.now_s
         due = step.in_time()
         before = dict.fromkeys(self.robots, _S.MISSION)
-        left_alone: set[str] = set()
+        to_restart: set[str] = set()
         while (left_s := began_s + step.duration_s - self._ground.now_s) > 0.0:
             if self.mission_ends:
                 return
@@ -520,70 +512,68 @@ class ScriptRun:
                 yield from self._perturb(due.pop(0))
             free_s = min([left_s, *(began_s + p.at_s - self._ground.now_s for p in due)])
             snapshot = self._ground.snapshot
-            self._look_for_others(snapshot)
+            self._check_other_commander(snapshot)
             statuses = self._statuses(snapshot)
             for name in self.robots:
                 status = statuses.get(name)
                 if status is None:
-                    self._say_once((name, NOT_HEARD), f"{name} is {NOT_HEARD}")
+                    self._report_once((name, NOT_HEARD), f"{name} is {NOT_HEARD}")
                     continue
-                given = name in self.given or _asked(snapshot.ground, status.robot_id) != "none"
-                if status.state is not _S.HOLD or given:
-                    left_alone.discard(name)
-                if before[name] is _S.MISSION and status.state is not _S.MISSION and not given:
+                action = _action_for(snapshot.ground, status.robot_id)
+                commanded = name in self.piloted or action != "none"
+                if status.state is not _S.HOLD or commanded:
+                    to_restart.discard(name)
+                if before[name] is _S.MISSION and status.state is not _S.MISSION and not commanded:
                     text = f"{name} left the mission: {state_and_reason(status)}"
-                    self._say_once((name, status.state, status.reason.code), text)
+                    self._report_once((name, status.state, status.reason.code), text)
                     if status.state is _S.HOLD:
-                        left_alone.add(name)
+                        to_restart.add(name)
                 before[name] = status.state
-                if step.restart and name in left_alone and free_s > _START_TAKES_S:
-                    yield from self._start_again(name)
+                if step.restart and name in to_restart and free_s > _MAX_START_S:
+                    yield from self._restart(name)
             if len(statuses) == len(self.robots) and all(map(is_down, statuses.values())):
-                raise ScriptError("nobody flies any more")
-            yield Until(lambda _: False, max(_LEAST_S, min(free_s, _PERIOD_S)))
+                raise ScriptError("no robot is in the air any more")
+            yield Until(lambda _: False, max(_MIN_WAIT_S, min(free_s, _PERIOD_S)))
 
-    def _start_again(self, name: str) -> Procedure[None]:
-        if self._ground.now_s - self._last_start_s.get(name, -math.inf) < _START_AGAIN_S:
+    def _restart(self, name: str) -> Procedure[None]:
+        if self._ground.now_s - self._last_start_s.get(name, -math.inf) < _RESTART_PERIOD_S:
             return
         self._last_start_s[name] = self._ground.now_s
         report = yield Start((name,))
         if not report.done:
-            text = f"{name} is not started again: {failures(report)}"
+            text = f"{name} is not restarted: {failures(report)}"
             codes = (report.problem and report.problem.code, *map(_codes, report.results))
-            self._say_once((name, "not started", codes), text)
+            self._report_once((name, "not started", codes), text)
 
     def _perturb(self, perturbation: Perturbation) -> Procedure[None]:
         name = perturbation.robot
         yield from self._require_of_flying(RobotCommand(perturbation.do, (name,)))
         if perturbation.do == "pilot":
-            self.given.add(name)
-            self._listener.line(f"{name} is given to a pilot")
+            self.piloted.add(name)
+            self._listener.line(f"{name} is handed to a pilot")
             return
 
         def holds(snapshot: FleetSnapshot) -> bool:
             status = self._statuses(snapshot).get(name)
             return status is not None and status.state is _S.HOLD
 
-        if not (yield Until(holds, _REJOIN_WITHIN_S)):
-            self._look_for_others(self._ground.snapshot)
-            raise ScriptError(f"{name} does not come to hold")
+        if not (yield Until(holds, _REJOIN_TIMEOUT_S)):
+            self._check_other_commander(self._ground.snapshot)
+            raise ScriptError(f"{name} does not hold")
         yield from self._require_of_flying(Start((name,)))
-        self.given.discard(name)
+        self.piloted.discard(name)
         self._listener.line(f"{name} is back in the mission")
 
-    def _look_for_others(self, snapshot: FleetSnapshot) -> None:
-        """The script gives no safety command from takeoff on: if all have one,
-        somebody has the fleet."""
+    def _check_other_commander(self, snapshot: FleetSnapshot) -> None:
+        """Raise ScriptError if all robots have a safety command, since the script gives none."""
         ground = snapshot.ground
-        asked = [_asked(ground, self._ground.setup.robots[name]) for name in self.robots]
-        if ground is not None and "none" not in asked:
+        actions = [_action_for(ground, self._ground.setup.robots[name]) for name in self.robots]
+        if ground is not None and "none" not in actions:
             by = ground.safety_action_by or ground.operator
-            raise ScriptError(f"{by} commands {asked[0]}: the fleet is theirs", hold=False)
-
-    # Around it
+            raise ScriptError(f"{by} commands {actions[0]}: the script ends", hold=False)
 
     def _statuses(self, snapshot: FleetSnapshot) -> dict[str, RobotStatus]:
-        """Of the addressed robots that are heard."""
+        """Fresh statuses of the script's robots."""
         return {
             robot.name: robot.status
             for robot in snapshot.robots
@@ -594,29 +584,29 @@ class ScriptRun:
         _require((yield request))
 
     def _require_of_flying(self, request: Takeoff | Start | RobotCommand) -> Procedure[None]:
-        """Carry out a request; a failure is none if somebody else has the fleet meanwhile."""
+        """Give a command in flight. If it fails, another operator's command is reported first."""
         report = yield request
         if not report.done:
             snapshot = yield from fresh_snapshot(self._ground)
-            # On the ground a safety command may be left from the last landing.
+            # On the ground, the last landing's command may still be in force.
             if not all(map(is_down, self._statuses(snapshot).values())):
-                self._look_for_others(snapshot)
+                self._check_other_commander(snapshot)
             raise ScriptError(failures(report))
 
-    def _say_once(self, what: Hashable, text: str) -> None:
-        """Say a text unless the same was said in other words, such as other numbers."""
-        if what not in self._said:
-            self._said.add(what)
+    def _report_once(self, what: Hashable, text: str) -> None:
+        """Show a text, unless one with the same key was shown, such as with other numbers."""
+        if what not in self._reported:
+            self._reported.add(what)
             self._listener.line(text)
 
 
 def take_site(
     site: SavedSite, setup: FleetSetup, robots: Collection[str]
 ) -> Procedure[CommandReport]:
-    """Have the robots fly at a site, each at the height that it has.
+    """Give robots a site's origin, fence and places; each robot keeps its height.
 
-    A place may be impossible within the fence that the robot has still, or the other way round: so
-    what failed is asked for again after the rest. Raises ValueError.
+    A place may be impossible in a robot's present fence, or the other way round, so failed requests
+    are repeated once after the others. Raises ValueError.
     """
     robots = addressed(setup, robots)
     requests: tuple[Request, ...] = (
@@ -632,18 +622,14 @@ def take_site(
                 return reports[i]
     results = []
     for name in robots:
-        its = [
+        failed = (
             result
             for report in reports.values()
             for result in report.results
-            if result.robot == name
-        ]
-        failed = [result for result in its if not result.done]
-        results.append(
-            failed[0]
-            if failed
-            else RobotResult(name, ResultCode.DONE, "has origin, fence and place")
+            if result.robot == name and not result.done
         )
+        done = RobotResult(name, ResultCode.DONE, "has origin, fence and place")
+        results.append(next(failed, done))
     return CommandReport(tuple(results))
 
 
@@ -662,8 +648,8 @@ def failures(report: CommandReport) -> str:
     return "; ".join(f"{r.robot}: {r.text}" for r in report.results if not r.done)
 
 
-def _asked(ground: GroundState | None, robot_id: int) -> str:
-    """Safety action that is asked of a robot; one that is not enabled is to hold."""
+def _action_for(ground: GroundState | None, robot_id: int) -> str:
+    """Safety action commanded to a robot; hold if it is not enabled."""
     if ground is None:
         return "none"
     safety_action = ground.safety_action_for(robot_id)

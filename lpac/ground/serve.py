@@ -1,4 +1,4 @@
-"""Servers of views, which run until they are stopped."""
+"""Run a view's server until it is stopped."""
 
 import asyncio
 import signal
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 async def serve(server: AbstractAsyncContextManager[T], ready: Callable[[T], None]) -> None:
-    """Serve until SIGINT or SIGTERM; `ready` is told where. Raises what the server raises."""
+    """Serve until SIGINT or SIGTERM. `ready` gets the server's value. Raises what it raises."""
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):

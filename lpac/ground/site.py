@@ -1,7 +1,7 @@
-"""Sites: where the mission frame, fence, pads and landing points lie; measured, and kept in files.
+"""Sites: mission frame, fence, pads and landing points, measured by the robots and kept in files.
 
-A site is `sites/NAME.toml` beside fleet.toml, in the mission frame, m. Who stands where is measured
-from what robots say of themselves, averaged over their statuses.
+A site is a file `sites/NAME.toml` beside fleet.toml, in the mission frame, m. Positions are
+averages over the robots' statuses.
 """
 
 import cmath
@@ -23,17 +23,17 @@ from edge.messages.mission import GroundState, Origin, Place, RobotStatus, SlotN
 from edge.robot.config import PlainName
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 
-# Beyond these a robot does not stand still, or does not know where it is.
+# With a larger spread, a robot moves or does not know its position.
 MAX_SPREAD_M = 2.0
 MAX_HEADING_SPREAD_DEG = 10.0
-# Closer together, two robots give no heading.
+# Shortest distance of two robots that gives a heading.
 MIN_BASELINE_M = 2.0
-# Who is further from the mission's origin is not where the mission is.
+# A robot beyond this distance from the origin is not at the mission's site.
 FAR_M = 500.0
-# How far a robot may stand from its pad by GPS, and by how much every other pad must be further.
+# Largest distance from a robot to its pad by GPS, and how much further any other pad must be.
 MAX_PAD_DISTANCE_M = 3.0
 CLEARLY_FURTHER_M = 1.0
-# `off` leaves a fence of this side around the mission's origin.
+# Side of the fence around the origin while the fence is off.
 WIDE_FENCE_M = 200.0
 
 _USED = "used"
@@ -41,20 +41,17 @@ _USED = "used"
 Point = tuple[float, float]
 
 
-# Measuring
-
-
 class CircularMean(NamedTuple):
-    """A mean direction in [0, 360), and how far the furthest is from it, deg."""
+    """A mean direction in [0, 360), and the largest deviation from it, deg."""
 
     mean_deg: float
     spread_deg: float
 
 
 class Standing(NamedTuple):
-    """Averaged position of a robot, (latitude, longitude), and its heading, None if unknown.
+    """Mean position (latitude, longitude) and heading of a standing robot; heading None if unknown.
 
-    The spreads are those of the statuses that were furthest from the average.
+    `spread_m` is the largest deviation from the mean.
     """
 
     robot: str
@@ -64,7 +61,7 @@ class Standing(NamedTuple):
 
 
 def circular_mean_deg(headings_deg: Sequence[float]) -> CircularMean:
-    """Raises ValueError if there are none, or they point all ways."""
+    """Circular mean of compass headings. Raises ValueError if there is none."""
     total = sum(cmath.rect(1.0, math.radians(h)) for h in headings_deg)
     if not abs(total) > 1e-6 * max(len(headings_deg), 1):
         raise ValueError("the headings have no mean")
@@ -73,15 +70,14 @@ def circular_mean_deg(headings_deg: Sequence[float]) -> CircularMean:
 
 
 def turn_deg(from_deg: float, to_deg: float) -> float:
-    """From one compass heading to another, clockwise positive, in [-180, 180]."""
+    """Angle from one compass heading to another, clockwise positive, in [-180, 180]."""
     return math.remainder(to_deg - from_deg, 360.0)
 
 
 def average_position(positions_deg: Sequence[Point]) -> Point:
-    """The middle of places (latitude, longitude) that are not far apart, anywhere on the earth.
+    """Mean of nearby positions (latitude, longitude), also at the poles and the date line.
 
-    The mean of the normals, which knows no poles and no date line. Raises ValueError if there are
-    none, or they have no middle.
+    Averages the normals. Raises ValueError if there is no mean.
     """
     normals = [_normal(*position) for position in positions_deg]
     x, y, z = (math.fsum(n[axis] for n in normals) for axis in range(3))
@@ -91,12 +87,12 @@ def average_position(positions_deg: Sequence[Point]) -> Point:
 
 
 def distance_m(from_deg: Point, to_deg: Point) -> float:
-    """Along the geodesic, m."""
+    """Length of the geodesic between two positions, m."""
     return float(Geodesic.WGS84.Inverse(*from_deg, *to_deg)["s12"])
 
 
 def bearing_deg(from_deg: Point, to_deg: Point) -> float:
-    """The compass heading in which the second place lies from the first, in [0, 360)."""
+    """Compass heading from the first position to the second, in [0, 360)."""
     return _compass_deg(Geodesic.WGS84.Inverse(*from_deg, *to_deg)["azi1"])
 
 
@@ -126,25 +122,25 @@ def error_deg(apart_m: float) -> float:
 
 
 def origin_at(first: Standing, toward: Standing | None) -> Origin:
-    """The mission frame whose origin is where the first robot stands.
+    """Mission frame with its origin at the first robot.
 
-    Its y axis points where the robot's nose points, or to the second robot. Raises ValueError if
-    there is no heading, or it cannot be trusted.
+    Its y axis points along the robot's nose, or toward the second robot. Raises ValueError if the
+    heading is unknown or not accurate enough.
     """
     if toward is not None:
         apart_m = distance_m(first.position_deg, toward.position_deg)
         if not apart_m >= MIN_BASELINE_M:
             raise ValueError(
-                f"{toward.robot} stands {apart_m:.1f} m from {first.robot}: it must be "
-                f"{MIN_BASELINE_M:g} m or more, and gives a better heading the further it is"
+                f"{toward.robot} stands {apart_m:.1f} m from {first.robot}: must be at least "
+                f"{MIN_BASELINE_M:g} m; more gives a better heading"
             )
         heading_deg = bearing_deg(first.position_deg, toward.position_deg)
     elif first.heading is None:
         raise ValueError(f"{first.robot} does not know its heading yet")
     elif first.heading.spread_deg > MAX_HEADING_SPREAD_DEG:
         raise ValueError(
-            f"{first.robot}: its heading moved by {first.heading.spread_deg:.0f} deg, allowed are "
-            f"{MAX_HEADING_SPREAD_DEG:g}: let it stand still, or use --toward another robot"
+            f"{first.robot}: its heading moved by {first.heading.spread_deg:.0f} deg, must be at "
+            f"most {MAX_HEADING_SPREAD_DEG:g}: let it stand still, or use --toward another robot"
         )
     else:
         heading_deg = first.heading.mean_deg
@@ -153,7 +149,7 @@ def origin_at(first: Standing, toward: Standing | None) -> Origin:
 
 
 def furthest_m(origin: Origin, snapshot: FleetSnapshot) -> float:
-    """How far the furthest robot that is heard stands from the origin, m; 0 if none is."""
+    """Distance from the origin to the furthest robot that is heard, m; 0 if none is."""
     place_deg = origin.latitude_deg, origin.longitude_deg
     return max(
         (
@@ -165,29 +161,25 @@ def furthest_m(origin: Origin, snapshot: FleetSnapshot) -> float:
     )
 
 
-def place_m(origin: Origin, position_deg: Point) -> Point:
-    """(x, y) of the mission frame, m, of a latitude and longitude."""
+def to_mission_frame_m(origin: Origin, position_deg: Point) -> Point:
+    """Convert (latitude, longitude) to (x, y) of the mission frame, m."""
     x_m, y_m, _ = origin.frame().relative_to(*position_deg).local_origin_m.tolist()
     return x_m, y_m
 
 
-# Robots and pads
-
-
 class OnPad(NamedTuple):
-    """At which slot's pad a robot stands (its height's number), and how far from it."""
+    """A robot's pad, by the number of its height, and the robot's distance from it, m."""
 
     height: int
     distance_m: float
 
 
 def assign(places_m: Mapping[str, Point], pads_m: Mapping[int, Point]) -> dict[str, OnPad]:
-    """Assign robots, by name, to pads, by the number of their slot's height.
+    """Assign robots, by name, to their nearest pads, by the number of the slot's height.
 
-    Every robot is at the pad nearest to it, which is the matching of the least total distance as
-    long as no pad is anybody else's. Raises ValueError, one line for all robots, if a robot is
-    more than `MAX_PAD_DISTANCE_M` from every pad, if another pad is not at least
-    `CLEARLY_FURTHER_M` further from it than its own, or if two robots are at one pad.
+    Raises ValueError, one line for all robots, if a robot is more than `MAX_PAD_DISTANCE_M` from
+    every pad, if another pad is not at least `CLEARLY_FURTHER_M` further than its own, or if two
+    robots are at one pad.
     """
     assigned: dict[str, OnPad] = {}
     problems: list[str] = []
@@ -196,15 +188,16 @@ def assign(places_m: Mapping[str, Point], pads_m: Mapping[int, Point]) -> dict[s
         if not near or not near[0][0] <= MAX_PAD_DISTANCE_M:
             nearest = f"; the nearest, {near[0][1]}, is {near[0][0]:.1f} m away" if near else ""
             problems.append(
-                f"{robot} at {_written(place)} m stands within {MAX_PAD_DISTANCE_M:g} m of no "
-                f"pad{nearest}"
+                f"{robot} at {_format_point(place)} m is not within {MAX_PAD_DISTANCE_M:g} m of "
+                f"any pad{nearest}"
             )
             continue
         own_m, height = near[0]
         if len(near) > 1 and near[1][0] < own_m + CLEARLY_FURTHER_M:
             problems.append(
-                f"{robot} at {_written(place)} m is ambiguous: pad {height} is {own_m:.1f} m and "
-                f"pad {near[1][1]} {near[1][0]:.1f} m away, must be {CLEARLY_FURTHER_M:g} m more"
+                f"{robot} at {_format_point(place)} m is ambiguous: pad {height} is {own_m:.1f} m "
+                f"and pad {near[1][1]} {near[1][0]:.1f} m away, must be {CLEARLY_FURTHER_M:g} m "
+                "more"
             )
             continue
         beside = next((name for name, its in assigned.items() if its.height == height), None)
@@ -217,17 +210,16 @@ def assign(places_m: Mapping[str, Point], pads_m: Mapping[int, Point]) -> dict[s
 
 
 class Pads(NamedTuple):
-    """The slots whose pads count, and where they are from, in words."""
+    """The slots whose pads are used, and their source in words."""
 
     source: str
     slots: tuple["SiteSlot", ...]
 
 
 def pads_in_use(sites: "Sites", name: str, setup: FleetSetup, origin: Origin) -> Pads:
-    """The pads of the site called `name`; if that is "", of the site that was used last.
+    """The pads of a site; if `name` is "", of the last site, while its origin is the fleet's.
 
-    That one counts as long as the fleet has its origin; else it is fleet.toml's pads. Raises
-    ValueError if the site called `name` has another origin.
+    Otherwise fleet.toml's pads. Raises ValueError if the named site has another origin.
     """
     chosen = name or sites.used()
     if chosen is not None:
@@ -244,15 +236,15 @@ def pads_in_use(sites: "Sites", name: str, setup: FleetSetup, origin: Origin) ->
     return Pads("fleet.toml", slots)
 
 
-def place_now_m(robot: str, statuses: Sequence[RobotStatus], origin: Origin) -> Point:
-    """(x, y) of the mission frame, m, averaged.
+def mean_position_m(robot: str, statuses: Sequence[RobotStatus], origin: Origin) -> Point:
+    """Mean position (x, y), mission frame, m.
 
-    Raises ValueError, one line, if the robot was not heard, is armed, has another origin, does not
+    Raises ValueError, one line, if the robot is not heard, is armed, has another origin, does not
     know its position, or moves.
     """
     _require_disarmed(robot, statuses)
     if statuses[-1].origin != origin:
-        raise ValueError(f"{robot} has not taken up the mission's origin")
+        raise ValueError(f"{robot} does not have the mission's origin yet")
     points = [s.position_m[:2] for s in statuses if s.position_m is not None and s.origin == origin]
     if not points:
         raise ValueError(f"{robot} does not know its position yet: wait for its GPS")
@@ -264,10 +256,10 @@ def place_now_m(robot: str, statuses: Sequence[RobotStatus], origin: Origin) -> 
 def assign_places(
     places_m: Mapping[str, Point], slots: Sequence["SiteSlot"], setup: FleetSetup
 ) -> tuple[dict[str, OnPad], dict[str, Place]]:
-    """`assign` to the slots' pads, and the places that follow.
+    """`assign` robots to the slots' pads; return that, and the resulting places.
 
-    Raises ValueError, too, if a robot stands at the pad of one that is left out, or the places are
-    too close to each other.
+    Also raises ValueError if a robot stands at the pad of a robot that is not included, or places
+    are too close to each other.
     """
     assigned = assign(places_m, {slot.height: (slot.pad_m[0], slot.pad_m[1]) for slot in slots})
     owners = {slot.place.slot: slot.robot for slot in setup.slots if slot.robot}
@@ -275,7 +267,7 @@ def assign_places(
         owner = owners.get(on_pad.height, robot)
         if owner not in assigned:
             raise ValueError(
-                f"{robot} stands at pad {on_pad.height}, which {owner} has: assign both at once"
+                f"{robot} stands at pad {on_pad.height} of {owner}: assign both at once"
             )
     by_height = {slot.height: slot for slot in slots}
     its = {robot: by_height[on_pad.height] for robot, on_pad in assigned.items()}
@@ -288,8 +280,8 @@ def assign_places(
 def places_at(site: "SavedSite", setup: FleetSetup, robots: Iterable[str]) -> dict[str, Place]:
     """Places of these robots at the site: each takes the slot with its present height.
 
-    Raises ValueError for a robot that sits in no slot, or in one that the site does not have, or if
-    the places are too close to each other.
+    Raises ValueError for a robot without a slot, for a height that the site does not have, or if
+    places are too close to each other.
     """
     heights = {slot.robot: slot.place.slot for slot in setup.slots if slot.robot}
     chosen = {}
@@ -300,25 +292,22 @@ def places_at(site: "SavedSite", setup: FleetSetup, robots: Iterable[str]) -> di
         slot = site.slot(height)
         if slot is None:
             known = ", ".join(str(slot.height) for slot in site.slots) or "none"
-            raise ValueError(f"{robot} flies at height {height}: the site has {known}")
+            raise ValueError(f"{robot} has height {height}: the site has {known}")
         chosen[robot] = slot
     require_apart(chosen.values(), setup.errors)
     return {robot: Place(slot.height, slot.landing_point_m) for robot, slot in chosen.items()}
 
 
 def wide_fence(configured: Fence) -> Fence:
-    """Fence while it is off: a square around the origin; the heights stay."""
+    """Fence in use while it is off: a square around the origin, with the same heights."""
     half_m = WIDE_FENCE_M / 2.0
     corners = ((-half_m, -half_m), (half_m, -half_m), (half_m, half_m), (-half_m, half_m))
     return Fence(corners, configured.buffer_m, configured.floor_m, configured.ceiling_m)
 
 
-# Files
-
-
 @dataclass(frozen=True, slots=True)
 class SiteSlot(Bounded):
-    """A place in the flight: its height's number, where it starts, and where it lands, (x, y)."""
+    """A place in the flight: the number of its height, its pad and its landing point, (x, y)."""
 
     height: SlotNumber
     pad_m: PointXY
@@ -329,7 +318,7 @@ class SiteSlot(Bounded):
 class SavedSite:
     """A place to fly at.
 
-    Raises ValueError if two slots have one height, or robots could not start or land there.
+    Raises ValueError if two slots have one height, or a pad or landing point is outside the fence.
     """
 
     origin: Origin
@@ -357,19 +346,19 @@ class SavedSite:
 
 
 def require_apart(slots: Iterable[SiteSlot], errors: ErrorBudget) -> None:
-    """Raises ValueError if those who start or land at these slots could touch in truth."""
+    """Raises ValueError if robots at these slots could touch, within the error budget."""
     places = places_apart(errors.position_m, errors.position_m)
     for slot, other in itertools.combinations(slots, 2):
         for name, beside in itertools.product(("pad_m", "landing_point_m"), repeat=2):
             apart_m = math.dist(getattr(slot, name), getattr(other, beside))
             if not places.holds(apart_m):
                 raise ValueError(
-                    f"height {slot.height}: {name} = {_written(getattr(slot, name))}: is "
+                    f"height {slot.height}: {name} = {_format_point(getattr(slot, name))}: is "
                     f"{apart_m:.1f} m from {beside} of height {other.height}, {places}"
                 )
 
 
-def site_as_it_stands(
+def measure_site(
     setup: FleetSetup,
     ground: GroundState | None,
     stands: Mapping[str, Standing],
@@ -378,11 +367,11 @@ def site_as_it_stands(
     *,
     land_at_pads: bool,
 ) -> SavedSite:
-    """The site whose pads are where the robots of `stands` stand now.
+    """Make a site whose pads are the present places of the robots in `stands`.
 
-    The origin is where `first` stands (see `origin_at`), else the fleet's. Fence, heights and
-    landing points are the fleet's, or the pads are the landing points. Raises ValueError if there
-    is no origin, a robot sits in no slot, or nobody could fly so.
+    The origin is that of `origin_at(first, toward)`, or the fleet's. Fence, heights and landing
+    points are the fleet's; with `land_at_pads`, the pads are the landing points. Raises ValueError
+    if there is no origin, a robot has no slot, or the site would not be valid.
     """
     if first is not None:
         origin = origin_at(first, toward)
@@ -396,8 +385,8 @@ def site_as_it_stands(
     for robot, its in stands.items():
         if robot not in seated:
             raise ValueError(_is_spare(robot))
-        # Without the minus of a zero.
-        x_m, y_m = (round(value, 2) + 0.0 for value in place_m(origin, its.position_deg))
+        # Adding 0 turns -0.0 into 0.0.
+        x_m, y_m = (round(value, 2) + 0.0 for value in to_mission_frame_m(origin, its.position_deg))
         _require_inside(robot, (x_m, y_m), fence, lands=land_at_pads)
         landing_m = (x_m, y_m) if land_at_pads else seated[robot].landing_point_m
         slots.append(SiteSlot(seated[robot].slot, (x_m, y_m), landing_m))
@@ -416,7 +405,7 @@ class Sites:
         self.folder = fleet_toml.parent / "sites"
 
     def path(self, name: str) -> Path:
-        """The file of a site."""
+        """Path of a site's file."""
         try:
             require(PlainName, name, "site")
         except ValueError as error:
@@ -424,35 +413,35 @@ class Sites:
         return self.folder / f"{name}.toml"
 
     def names(self) -> list[str]:
-        """Of all sites, in alphabetical order."""
+        """Names of all sites, in alphabetical order."""
         return sorted(path.stem for path in self.folder.glob("*.toml"))
 
     def load(self, name: str) -> SavedSite:
-        """A site that was saved."""
+        """Load a saved site."""
         path = self.path(name)
         if not path.exists():
             known = ", ".join(self.names()) or "none"
-            raise ConfigError(f"{path}: there is no such site; known are {known}")
+            raise ConfigError(f"{path}: no such site; known are {known}")
         return from_mapping(SavedSite, read_toml(path), str(path))
 
     def require_new(self, name: str) -> None:
-        """Raises ConfigError if there is a site of that name."""
+        """Raises ConfigError if a site of that name exists."""
         path = self.path(name)
         if path.exists():
-            raise ConfigError(f"{path}: is there already: add --force to replace it")
+            raise ConfigError(f"{path}: exists already: add --force to replace it")
 
     def save(self, name: str, site: SavedSite) -> Path:
-        """Write the site's file, at once and for good; returns its path."""
+        """Write the site's file atomically; return its path."""
         path = self.path(name)
         _write(path, _toml(name, site))
         return path
 
     def use(self, name: str) -> None:
-        """Remember that this site is the one in use."""
+        """Note that this site is in use."""
         _write(self.folder / _USED, f"{name}\n")
 
     def used(self) -> str | None:
-        """The site that was used last; None if there was none, or it is gone."""
+        """Name of the site that was used last; None if there was none or it is gone."""
         try:
             name = (self.folder / _USED).read_text().strip()
         except FileNotFoundError:
@@ -470,8 +459,8 @@ def _require_disarmed(robot: str, statuses: Sequence[RobotStatus]) -> None:
 def _require_still(robot: str, spread_m: float) -> None:
     if not spread_m <= MAX_SPREAD_M:
         raise ValueError(
-            f"{robot}: its position moved by {spread_m:.1f} m, allowed are {MAX_SPREAD_M:g} m: let "
-            "it stand still until its GPS has settled"
+            f"{robot}: its position moved by {spread_m:.1f} m, must be at most {MAX_SPREAD_M:g} m: "
+            "let it stand still until its GPS has settled"
         )
 
 
@@ -484,13 +473,13 @@ def _require_inside(robot: str, place: Point, fence: Fence, *, lands: bool) -> N
     else:
         where = "outside the fence"
     raise ValueError(
-        f"{robot} stands at {_written(place)} m, {where}: another --from/--toward, or `lpac "
+        f"{robot} stands at {_format_point(place)} m, {where}: another --from/--toward, or `lpac "
         "mission fence set`"
     )
 
 
 def _is_spare(robot: str) -> str:
-    return f"{robot} sits in no slot, as a spare: `lpac fleet swap` seats it"
+    return f"{robot} is a spare: `lpac fleet swap` gives it a slot"
 
 
 def _normal(latitude_deg: float, longitude_deg: float) -> tuple[float, float, float]:
@@ -505,7 +494,7 @@ def _compass_deg(angle_deg: float) -> float:
     return heading_deg if heading_deg < 360.0 else 0.0
 
 
-def _written(point: Iterable[float]) -> str:
+def _format_point(point: Iterable[float]) -> str:
     return f"({', '.join(f'{value:.1f}' for value in point)})"
 
 

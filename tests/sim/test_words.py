@@ -59,17 +59,17 @@ def wordless(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
         def problem(code: ProblemCode, _: str) -> Problem:
             return Problem(code, "x")
 
-        tell = Station.tell
+        notify = Station.notify
 
-        def tell_nothing(
+        def notify_nothing(
             station: Station, kind: Any, name: str, _: str, *more: Any, **known: Any
         ) -> None:
-            tell(station, kind, name, "x", *more, **known)
+            notify(station, kind, name, "x", *more, **known)
 
         monkeypatch.setattr(codes, "_shorten", forget)
         monkeypatch.setattr(commands, "RobotResult", result)
         monkeypatch.setattr(commands, "Problem", problem)
-        monkeypatch.setattr(Station, "tell", tell_nothing)
+        monkeypatch.setattr(Station, "notify", notify_nothing)
 
     return begin
 
@@ -194,7 +194,7 @@ def commanded() -> list[object]:
     last = field.robots[0].said
     for i, not_taken in enumerate(((), (unusable,))):
         lacking = replace(last, world_id="old", not_taken=not_taken, sequence=last.sequence + 1 + i)
-        station.hear_status(lacking)
+        station.receive_status(lacking)
         told.append(station.published_world())
     assert told[-2:] == [OTHER_WORLD, None]
     events = [(e.kind, e.robot, e.operator, e.trial) for e in field.events[began:]]

@@ -190,13 +190,13 @@ def _in_slots(config: "FleetConfig", robots: Sequence["RobotHost"]) -> list["Rob
     """Raises ValueError if none is."""
     chosen = [robot for robot in robots if config.slot_of(robot.name) is not None]
     if not chosen:
-        raise ValueError(f"{config.path}: slots: no robot sits in one")
+        raise ValueError(f"{config.path}: slots: no robot has one")
     return chosen
 
 
 def _print_remarks(config: "FleetConfig", trial_s: float) -> None:
     if config.insecure:
-        typer.secho("insecure: whoever is on the network can fly this fleet", fg="yellow")
+        typer.secho("insecure: anyone on the network can fly this fleet", fg="yellow")
     typer.echo(f"trials: how many of {trial_s:g} s each pack lasts for; --trial SECONDS for others")
 
 

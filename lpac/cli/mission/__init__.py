@@ -280,8 +280,8 @@ def assign(
     Refused if a robot is more than 3 m from every pad, if another pad is less than 1 m further than
     the nearest, or if two robots stand at one pad.
     """
-    from lpac.ground.procedure import gather
-    from lpac.ground.site import Sites, assign_places, pads_in_use, place_now_m
+    from lpac.ground.procedure import collect_statuses
+    from lpac.ground.site import Sites, assign_places, mean_position_m, pads_in_use
     from lpac.ground.station.protocol import SetPlaces
     from lpac.ground.station.subscriber import addressed
 
@@ -293,8 +293,8 @@ def assign(
             raise ValueError("assign: the origin is not set: `lpac mission origin` sets it")
         pads = pads_in_use(Sites(to.path), site, setup, ground.origin)
         with interruptible("assign"):
-            heard = subscriber.carry_out(gather(subscriber, names, seconds))
-        places_m = {name: place_now_m(name, heard[name], ground.origin) for name in names}
+            heard = subscriber.carry_out(collect_statuses(subscriber, names, seconds))
+        places_m = {name: mean_position_m(name, heard[name], ground.origin) for name in names}
     assigned, places = assign_places(places_m, pads.slots, setup)
     typer.echo(f"pads of {pads.source}", err=True)
     details = {

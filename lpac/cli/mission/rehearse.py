@@ -75,11 +75,11 @@ def _watch(
 
 
 def _print_json(subscriber: "GroundSubscriber", names: "Sequence[str]") -> None:
-    from lpac.ground.rehearsal import carried
+    from lpac.ground.rehearsal import carried_robot
 
     for robot in subscriber.snapshot.robots:
         if robot.name in names and robot.status is not None and robot.fresh:
-            seen = carried(robot.status, subscriber.setup.fence)
+            seen = carried_robot(robot.status, subscriber.setup.fence)
             commanded = seen.commanded and seen.commanded._asdict()
             line = {"robot": robot.name, **seen._asdict(), "commanded": commanded}
             typer.echo(json.dumps(line))
@@ -123,7 +123,7 @@ def _line(row: "list[Text]") -> str:
 
 
 def _rows(subscriber: "GroundSubscriber", names: "Sequence[str]") -> list[list["Text"]]:
-    from lpac.ground.rehearsal import carried
+    from lpac.ground.rehearsal import carried_robot
 
     rows = []
     for robot in subscriber.snapshot.robots:
@@ -132,7 +132,7 @@ def _rows(subscriber: "GroundSubscriber", names: "Sequence[str]") -> list[list["
         if robot.status is None or not robot.fresh:
             rows.append([styled(robot.name, ""), styled("not heard", BAD)])
             continue
-        seen = carried(robot.status, subscriber.setup.fence)
+        seen = carried_robot(robot.status, subscriber.setup.fence)
         if seen.position_m is None:
             why = "no origin" if robot.status.origin is None else "no position"
             x, y, inside = styled(why, NOTABLE), styled("", ""), styled("", "")

@@ -119,7 +119,7 @@ class _View:
             typer.echo(json.dumps({"step": self._step, "duration_s": duration_s}))
         self._step = ""
 
-    def may(self, question: str) -> bool:
+    def confirm(self, question: str) -> bool:
         """Ask at the terminal, between two trials."""
         self.end_step()
         if self._yes:

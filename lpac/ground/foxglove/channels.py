@@ -1,4 +1,4 @@
-"""The channels on which a `FoxgloveView`'s messages go to a client, or into a file."""
+"""Channels for a `FoxgloveView`'s messages, to clients or into a file."""
 
 from typing import Any
 
@@ -19,11 +19,11 @@ _FLEET = topic("Fleet", ShownFleet)
 
 
 class Channels:
-    """All of them in one `Context`, whose servers and files get what is published."""
+    """All channels of one `Context`."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        # Known before there is any message, so that a client sees what there will be.
+        # Created before any message, so that clients see all topics at once.
         self._foxglove: dict[str, Any] = {
             "/tf": FrameTransformsChannel("/tf", context=context),
             "/robots": SceneUpdateChannel("/robots", context=context),
@@ -39,14 +39,14 @@ class Channels:
         }
 
     def publish(self, shown: Shown) -> None:
-        """Give it to whoever listens; nothing waits."""
+        """Publish without waiting."""
         time_ns = int(shown.unix_time_s * 1e9)
         channel = self._foxglove.get(shown.topic)
         if channel is not None:
             channel.log(shown.message, log_time=time_ns)
             return
         if shown.topic not in self._json:
-            # A robot's.
+            # /robot/<name>
             self._json[shown.topic] = self._json_channel(shown.topic, ROBOT_TOPICS["status"])
         self._json[shown.topic].log(encode(shown.message), log_time=time_ns)
 

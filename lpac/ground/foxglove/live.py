@@ -1,7 +1,6 @@
-"""`lpac foxglove live`: a WebSocket that Foxglove connects to; a client of the ground process.
+"""`lpac foxglove live`: WebSocket server for Foxglove, a client of the ground process.
 
-Clients can subscribe, and nothing else: whoever is connected, the fleet hears nothing of it. Each
-has a queue of its own, so that a slow one misses messages, and no other does.
+Foxglove clients can only subscribe. Each has its own queue, so that a slow one delays no other.
 """
 
 import asyncio
@@ -24,7 +23,7 @@ _NO_GROUND = "ground"
 
 @contextlib.asynccontextmanager
 async def serving(fleet: str, *, host: str, port: int) -> AsyncIterator[int]:
-    """Serve a fleet to Foxglove as long as this context lasts; gives the port.
+    """Serve a fleet to Foxglove within this context; gives the port.
 
     Port 0 takes a free one. Raises OSError if it cannot listen there.
     """
@@ -48,7 +47,7 @@ async def serving(fleet: str, *, host: str, port: int) -> AsyncIterator[int]:
 
 
 async def _follow(fleet: str, channels: Channels, server: WebSocketServer) -> None:
-    """Listen to the ground, and again when it comes back; for ever."""
+    """Follow the ground process forever, reconnecting when it has ended."""
     view = FoxgloveView()
 
     def show(topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
@@ -58,12 +57,12 @@ async def _follow(fleet: str, channels: Channels, server: WebSocketServer) -> No
     with contextlib.closing(Recording(show)) as recording:
         while True:
             try:
-                async for told in listen(fleet):
-                    recording.take(told, time.time())
-                    if isinstance(told, FleetSetup):
+                async for message in listen(fleet):
+                    recording.take(message, time.time())
+                    if isinstance(message, FleetSetup):
                         server.remove_status([_NO_GROUND])
-                    elif isinstance(told, FleetSnapshot):
-                        for shown in view.tick(told.unix_time_s):
+                    elif isinstance(message, FleetSnapshot):
+                        for shown in view.tick(message.unix_time_s):
                             channels.publish(shown)
             except (OSError, ValueError) as error:
                 server.publish_status(str(error), StatusLevel.Warning, _NO_GROUND)

@@ -1,4 +1,4 @@
-"""`lpac foxglove log`: a ground's log as an MCAP file with Foxglove's own messages."""
+"""`lpac foxglove log`: convert a ground's log to an MCAP file of Foxglove's own messages."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,22 +11,22 @@ from lpac.ground.foxglove.view import FoxgloveView
 
 
 def ground_logs(folder: Path) -> list[Path]:
-    """The ground's logs below a folder, in their order. Raises ValueError if there are none."""
+    """Find the ground's logs below a folder, in order. Raises ValueError if there are none."""
     if not folder.is_dir():
         raise ValueError(f"{folder}: is not a folder")
     paths = sorted(path for path in folder.rglob("ground-*.mcap") if path.is_file())
     if not paths:
         raise ValueError(
-            f"{folder}: holds no log of a ground (ground-*.mcap): `lpac record` writes one; a "
-            "robot's own log, robot-*.mcap, Foxglove opens as it is"
+            f"{folder}: has no ground's log (ground-*.mcap): `lpac record` writes one; Foxglove "
+            "opens a robot's own log, robot-*.mcap, directly"
         )
     return paths
 
 
 def convert(paths: Sequence[Path], out: Path, progress: Callable[[int], None]) -> None:
-    """Write what Foxglove would have been shown live; `progress` is told the number of files done.
+    """Write the messages that a live view would show; `progress` gets the number of files done.
 
-    Raises FlightLogError for a file that is no log, OSError for one that cannot be read or written.
+    Raises FlightLogError for a file that is not a log, or OSError.
     """
     context = Context()
     channels, view = Channels(context), FoxgloveView()

@@ -1,16 +1,16 @@
-"""A fleet in Foxglove: the ground's log, topic by topic, as Foxglove's own messages.
+"""Convert the ground's log to Foxglove's own messages.
 
-Pure. What comes in is what `lpac.ground.record` writes, whether it happens now or was read from a
-file; so a flight looks the same live and afterwards. What goes out:
+Pure. The input is what `lpac.ground.record` writes, live or from a file, so that a flight looks the
+same in both. The output:
 
 | topic | schema | when |
 | --- | --- | --- |
 | `/tf` | `foxglove.FrameTransforms`: `mission` -> the robot's name | with each status |
 | `/robots` | `foxglove.SceneUpdate`: a robot's place, nose, name and state | with each status |
 | `/robot/<name>` | `lpac.Status`, as in the robot's own log | with each status |
-| `/cells` | `foxglove.SceneUpdate`: the Voronoi cells of who counts for the cost | with each cost |
+| `/cells` | `foxglove.SceneUpdate`: Voronoi cells of the robots of the cost | with each cost |
 | `/cost` | `lpac.Cost` | with each cost |
-| `/log` | `foxglove.Log`: what was commanded, and what came of it | as it happens |
+| `/log` | `foxglove.Log`: commands and their results | as they happen |
 | `/fleet` | `lpac.Fleet`: a row for each robot, in the fleet's order | at 2 Hz |
 | `/fence` | `foxglove.SceneUpdate` | at 1 Hz |
 | `/density` | `foxglove.Grid`, field `importance`: 0 to 255, the world's highest | at 1 Hz |
@@ -70,10 +70,10 @@ from lpac.ground.rendering import Row, cell, nose_rad, problem, rows, speed_m_s,
 
 FRAME = "mission"
 FLEET_PERIOD_S = 0.5
-# A late client sees no message that came before it, so that what stays is said again.
+# A new client gets no earlier messages, so static ones are repeated.
 STILL_PERIOD_S = 1.0
 _DENSITY_CELLS = 128
-# Each is drawn a little above the one before.
+# Each slightly above the one before.
 _DENSITY_Z_M, _SEEN_Z_M, _LINES_Z_M = -0.06, -0.03, 0.0
 _ROBOT_M = 0.5
 _GREY, _BLUE, _YELLOW, _VIOLET, _ORANGE, _RED, _WHITE = (
@@ -98,10 +98,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class ShownRobot:
-    """A robot's row; of one that was never heard only the name is known.
+    """A robot's row; of a robot that was never heard, only the name is known.
 
-    `state`, `problem` and `severity` are those of all views, `heard_s_ago` is its newest status's
-    age, s, `neighbours` how many it hears; all else is as in `RobotStatus`.
+    `state`, `problem` and `severity` are as in all views, `heard_s_ago` is the age of its newest
+    status, s, `neighbours` their number; the others are as in `RobotStatus`.
     """
 
     name: str
@@ -120,7 +120,7 @@ class ShownRobot:
 
 @dataclass(frozen=True, slots=True)
 class ShownFleet:
-    """The fleet; `seen_share` is how much of the world somebody has seen, from 0 to 1."""
+    """The fleet; `seen_share` is the share of the world that any robot has seen, 0 to 1."""
 
     trial: str
     safety_action: str
@@ -129,7 +129,7 @@ class ShownFleet:
 
 
 class Shown(NamedTuple):
-    """A message of a topic: one of Foxglove's, or a dataclass that becomes JSON."""
+    """A message of a topic: one of Foxglove's, or a dataclass to be sent as JSON."""
 
     topic: str
     unix_time_s: float
@@ -137,27 +137,28 @@ class Shown(NamedTuple):
 
 
 class FoxgloveView:
-    """Takes a ground's log in its order, and says what Foxglove is to be shown."""
+    """Converts a ground's log, message by message, for Foxglove."""
 
     def __init__(self) -> None:
         self._setup: FleetSetup | None = None
         self._coverage: Coverage | None = None
         self._state: GroundState | None = None
-        # By name: when it was heard, and what it said then.
+        # By name: when it was received, Unix time, and the status.
         self._statuses: dict[str, tuple[float, RobotStatus]] = {}
         self._explored: dict[str, npt.NDArray[np.bool_]] = {}
         self._fleet_at_s = self._still_at_s = -math.inf
 
     def take(self, topic: str, unix_time_s: float, logged: Mapping[str, object]) -> Iterator[Shown]:
-        """Messages that are new with one of the log. Raises ValueError if it is not the log's."""
+        """Convert a message of the log. Raises ValueError if it is not valid."""
         match topic:
             case "setup":
                 self._take_setup(_logged(FleetSetup, logged))
             case "state":
                 self._state = _logged(GroundState, logged)
             case "explored":
-                said = _logged(Explored, logged)
-                self._explored[said.robot] = explored_from_bytes(base64.b64decode(said.cells))
+                explored = _logged(Explored, logged)
+                cells = explored_from_bytes(base64.b64decode(explored.cells))
+                self._explored[explored.robot] = cells
             case "status":
                 status = _logged(RobotStatus, logged)
                 yield from self._take_status(str(logged["name"]), status, unix_time_s)
@@ -171,10 +172,10 @@ class FoxgloveView:
                 yield Shown("/log", unix_time_s, _event(event))
 
     def tick(self, unix_now_s: float) -> Iterator[Shown]:
-        """Messages that are due by now, however little has happened."""
+        """Messages that are due periodically."""
         if self._setup is None:
             return
-        # The clock may be set.
+        # abs: the clock may be set back.
         if abs(unix_now_s - self._fleet_at_s) >= FLEET_PERIOD_S:
             self._fleet_at_s = unix_now_s
             yield Shown("/fleet", unix_now_s, self._fleet(self._setup, unix_now_s))
@@ -242,8 +243,8 @@ class FoxgloveView:
         )
 
     def _fence(self, setup: FleetSetup, unix_time_s: float) -> SceneUpdate:
-        told = self._state.fence if self._state is not None else None
-        fence = setup.fence if told is None else told
+        commanded = self._state.fence if self._state is not None else None
+        fence = setup.fence if commanded is None else commanded
         return SceneUpdate(entities=[_outline("fence", fence.vertices_m, _RED, unix_time_s)])
 
     def _fleet(self, setup: FleetSetup, unix_now_s: float) -> ShownFleet:
@@ -256,19 +257,19 @@ class FoxgloveView:
         )
 
     def _rows(self, setup: FleetSetup, unix_now_s: float) -> list[Row]:
-        heard = (
-            RobotSnapshot(name, robot_id, status, max(0.0, unix_now_s - heard_at_s))
-            if heard_at_s is not None
+        robots = (
+            RobotSnapshot(name, robot_id, status, max(0.0, unix_now_s - received_s))
+            if received_s is not None
             else RobotSnapshot(name, robot_id)
             for name, robot_id in setup.robots.items()
-            for heard_at_s, status in (self._statuses.get(name, (None, None)),)
+            for received_s, status in (self._statuses.get(name, (None, None)),)
         )
         commander = "" if self._state is None else self._state.operator
-        snapshot = FleetSnapshot(unix_now_s, commander, self._state, tuple(heard))
+        snapshot = FleetSnapshot(unix_now_s, commander, self._state, tuple(robots))
         return rows(setup, snapshot, alarms(setup, snapshot))
 
     def _seen(self) -> npt.NDArray[np.uint8]:
-        """(EXPLORED_CELLS, EXPLORED_CELLS), indexed [x, y]: how many robots have seen it."""
+        """How many robots have seen each cell: (EXPLORED_CELLS, EXPLORED_CELLS), by [x, y]."""
         seen = np.zeros((EXPLORED_CELLS, EXPLORED_CELLS), np.int64)
         for cells in self._explored.values():
             seen += cells
@@ -277,7 +278,7 @@ class FoxgloveView:
     def _grid(
         self, topic: str, name: str, values: npt.NDArray[np.uint8], z_m: float, unix_time_s: float
     ) -> Shown:
-        """`values` are of the whole world, indexed [x, y]."""
+        """Grid over the whole world; `values` are indexed [x, y]."""
         assert self._setup is not None
         side = len(values)
         cell_m = self._setup.world_size / self._setup.env_scale / side
@@ -292,13 +293,13 @@ class FoxgloveView:
         return Shown(topic, unix_time_s, grid)
 
 
-# A robot that is not heard any more is gone, and so is its cell.
+# A robot that is no longer heard disappears, with its cell.
 _LIFETIME = Duration(sec=int(FRESH_S), nsec=int(FRESH_S % 1.0 * 1e9))
 _SIZE = Vector3(x=_ROBOT_M, y=_ROBOT_M, z=_ROBOT_M / 2.0)
 
 
 def _logged(kind: type[T], logged: Mapping[str, object]) -> T:
-    """As it was before it was logged; of another version's keys those that are known here."""
+    """Decode a logged message; unknown keys, as of another version, are ignored."""
     try:
         return msgspec.convert(logged, kind)
     except msgspec.MsgspecError as error:
@@ -316,7 +317,7 @@ def _event(event: GroundEvent) -> Log:
 def _outline(
     name: str, corners_m: Sequence[Sequence[float]], color: Color, unix_time_s: float
 ) -> SceneEntity:
-    """A polygon on the ground; corners are (x, y), m."""
+    """Polygon on the ground; corners are (x, y), m."""
     line = LinePrimitive(
         type=LinePrimitiveLineType.LineLoop, pose=_NOWHERE, thickness=2.0, scale_invariant=True,
         points=[Point3(x=x_m, y=y_m, z=_LINES_Z_M) for x_m, y_m in corners_m], color=color,
@@ -347,7 +348,7 @@ def _shown_row(row: Row) -> ShownRobot:
 
 
 def _yaw_rad(status: RobotStatus) -> float:
-    """From the mission frame's x axis to its y axis; along y as long as it is not known."""
+    """Angle of the nose from the mission frame's x axis toward y; along y while unknown."""
     return math.pi / 2.0 - (nose_rad(status) or 0.0)
 
 

@@ -1,7 +1,6 @@
-"""The map's connections: so many in all and of each address, and none that never asks.
+"""Connections of the live map, limited in total and per address; idle ones are closed.
 
-Whoever is on the network can open as many as it likes; without limits they take all descriptors,
-and no new page opens.
+Without limits, anyone on the network could use up all file descriptors.
 """
 
 import asyncio
@@ -15,25 +14,25 @@ from dataclasses import dataclass, field
 from aiohttp import web
 from aiohttp.web_protocol import RequestHandler
 
-# A browser opens six for the files of a page, and keeps one.
+# A browser opens six for a page's files, and keeps one.
 MOST_OF_ADDRESS = 32
 MOST = 256
-# For the TLS handshake, and then for the head of the first request.
+# Timeout of the TLS handshake, and then of the first request's head.
 HEAD_S = 5.0
-# Of a connection between two requests.
+# Timeout between two requests.
 _KEPT_S = 15.0
 
 
 @dataclass(slots=True)
 class _Place:
-    """Connection state, kept from its beginning, before any TLS."""
+    """State of a connection from its acceptance, before any TLS."""
 
     asked: bool = False
     ended: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 class Connection(RequestHandler):
-    """One connection, which ends if it asks for nothing."""
+    """Connection that is closed unless it sends a request in time."""
 
     __slots__ = ("_head", "_place")
 
@@ -44,19 +43,19 @@ class Connection(RequestHandler):
         self._head: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """It is open, and over TLS its handshake is done."""
+        """Start the timeout; over TLS, after the handshake."""
         super().connection_made(transport)
         assert isinstance(transport, asyncio.Transport)
         self._head = asyncio.get_running_loop().call_later(HEAD_S, transport.abort)
 
     def asked(self) -> None:
-        """The head of a request came."""
+        """Note that the head of a request has been received."""
         self._place.asked = True
         if self._head is not None:
             self._head.cancel()
 
     def connection_lost(self, exc: BaseException | None) -> None:
-        """It is closed."""
+        """Release the connection's place."""
         self.asked()
         self._place.ended.set()
         super().connection_lost(exc)
@@ -66,7 +65,7 @@ class Connection(RequestHandler):
 async def accepting(
     server: web.Server, host: str, port: int, tls: ssl.SSLContext | None
 ) -> AsyncIterator[tuple[str, int]]:
-    """Accept connections there as long as this context lasts; gives the address and the port.
+    """Accept connections within this context; gives the address and port.
 
     Raises OSError if it cannot listen there.
     """
@@ -91,18 +90,18 @@ async def _accept(listening: socket.socket, server: web.Server, tls: ssl.SSLCont
         while True:
             try:
                 accepted, (address, *_) = await loop.sock_accept(listening)
-            except OSError:  # It has gone again, or other files have taken all descriptors.
+            except OSError:  # The client has gone, or no descriptors are left.
                 await asyncio.sleep(0.1)
                 continue
             if len(open_now) >= MOST and of_address[address] < MOST_OF_ADDRESS:
-                # The one that has asked for nothing for longest makes room.
+                # Close the oldest connection without a request.
                 idle = (task for task, place in open_now.items() if not place.asked)
                 if (oldest := next(idle, None)) is not None:
                     oldest.cancel()
                     await asyncio.wait([oldest])
             if len(open_now) >= MOST or of_address[address] >= MOST_OF_ADDRESS:
                 accepted.close()
-                # Whoever floods it leaves the others their turn.
+                # Let other tasks run during a flood.
                 await asyncio.sleep(0)
                 continue
             of_address[address] += 1

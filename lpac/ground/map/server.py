@@ -1,7 +1,6 @@
-"""`lpac map`: a page on the laptop that shows the fleet; a client of the ground process.
+"""`lpac map`: web server of the live map, a client of the ground process.
 
-One event loop: it listens to the ground, and gives each page what is new. Coverage is computed
-beside it, in threads.
+One event loop follows the ground and sends updates to each page. Coverage is computed in threads.
 """
 
 import asyncio
@@ -17,9 +16,9 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
-from lpac.ground.alarms import Alarm, Before, alarms
+from lpac.ground.alarms import Alarm, SnapshotHistory, alarms
 from lpac.ground.cost import Cost, MissionCosts, positions_of
-from lpac.ground.map.access import Access, reached_at
+from lpac.ground.map.access import Access, server_addresses
 from lpac.ground.map.connections import Connection, accepting
 from lpac.ground.map.view import (
     Curve,
@@ -44,7 +43,7 @@ _FILES = {
     "/map.css": ("map.css", "text/css"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
-# Of the page's own files alone, and with no script or style within the page.
+# Only the page's own files, and no inline scripts or styles.
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -57,19 +56,19 @@ _HEADERS = {
     "Cache-Control": "no-store",
 }
 _RETRY_S = 1.0
-# A page that takes nothing for this long is gone.
+# WebSocket ping period; a page that does not answer is closed.
 _HEARTBEAT_S = 10.0
 _MAX_EVENTS = 200
 _MAX_REQUEST_BYTES = 4096
 
-# All that a page can ask of the fleet. Kill is not among it: `lpac mission kill` asks.
+# Commands that a page can give. Not kill, for which `lpac mission kill` asks first.
 _ACTIONS = ("enable", "takeoff", "start", "hold", "resume", "return", "land", "command")
 
 
 class Outbox:
-    """Queue of one open page: of each kind the newest message alone, and the last events.
+    """Queue of an open page: the newest message of each kind, and the last events.
 
-    So a page that takes it slowly misses snapshots, and costs no memory.
+    A slow page misses snapshots, and does not use up memory.
     """
 
     def __init__(self) -> None:
@@ -87,7 +86,7 @@ class Outbox:
         self._some.set()
 
     async def take(self) -> list[str]:
-        """All that there is, in order; waits until there is something."""
+        """Wait for messages and return all of them, in order."""
         await self._some.wait()
         texts = [*self._newest.values(), *self._each]
         self._newest.clear()
@@ -97,7 +96,7 @@ class Outbox:
 
 
 class LiveMap:
-    """Shows one fleet to any number of pages; acts only with `operate`."""
+    """Live map of one fleet for any number of pages; commands only with `operate`."""
 
     def __init__(self, fleet: str, access: Access, *, operate: bool) -> None:
         self._fleet = fleet
@@ -106,14 +105,14 @@ class LiveMap:
         self._pages: set[Outbox] = set()
         self._sockets: set[web.WebSocketResponse] = set()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._problem = "no word from the ground process yet"
+        self._problem = "not connected to the ground process yet"
         self._setup: FleetSetup | None = None
         self._setup_text = ""
         self._snapshot: FleetSnapshot | None = None
-        # Of the robots that count for the cost, in this snapshot, m.
+        # Positions, m, of the robots that count for the cost.
         self._places_m: dict[str, tuple[float, float]] = {}
         self._alarms: tuple[Alarm, ...] = ()
-        self._before = Before()
+        self._history = SnapshotHistory()
         self._explored: dict[str, Explored] = {}
         self._events: deque[GroundEvent] = deque(maxlen=_MAX_EVENTS)
         self._costs = MissionCosts()
@@ -122,7 +121,7 @@ class LiveMap:
         self._new_snapshot = asyncio.Event()
 
     def app(self) -> web.Application:
-        """The web server's part; `follow` and `compute` must run beside it."""
+        """Make the web application; `follow` and `compute` must run beside it."""
         app = web.Application(middlewares=[self._guard], client_max_size=_MAX_REQUEST_BYTES)
         for path in _FILES:
             app.router.add_get(path, self._file)
@@ -130,10 +129,8 @@ class LiveMap:
         app.on_shutdown.append(self._close)
         return app
 
-    # From the ground
-
     async def follow(self) -> None:
-        """Listen to the ground, and again when it comes back; for ever."""
+        """Follow the ground process forever, reconnecting when it has ended."""
         while True:
             try:
                 async for message in listen(self._fleet):
@@ -141,7 +138,7 @@ class LiveMap:
             except (OSError, ValueError) as error:
                 self._problem = str(error)
                 self._costs.interrupt()
-                self._before = Before()
+                self._history = SnapshotHistory()
                 self._put(self._ground_view())
             await asyncio.sleep(_RETRY_S)
 
@@ -170,7 +167,7 @@ class LiveMap:
         if self._setup is None:
             return
         self._snapshot = snapshot
-        before = self._before.take(snapshot, time.monotonic())
+        before = self._history.add(snapshot, time.monotonic())
         self._alarms = alarms(self._setup, snapshot, before)
         self._places_m = self._costs.follow(snapshot)
         self._paths.take(snapshot, self._places_m)
@@ -189,10 +186,8 @@ class LiveMap:
             if row.robot.name == page.selected:
                 page.put(_text(detail_view(row, self._snapshot, self._alarms)), "detail")
 
-    # Coverage
-
     async def compute(self) -> None:
-        """The cost and the cells of the newest snapshot, again and again; for ever."""
+        """Compute the newest snapshot's cost and cells, forever."""
         while True:
             await self._new_snapshot.wait()
             self._new_snapshot.clear()
@@ -212,11 +207,11 @@ class LiveMap:
         )
         if coverage is not self._costs.coverage:
             return
-        judged, share = self._costs.cost(snapshot, places_m, cost), None
+        evaluated, share = self._costs.cost(snapshot, places_m, cost), None
         time_s = self._costs.mission_s(snapshot)
-        curve = self._curve_of(judged)
-        if curve is not None and time_s is not None and judged.normalized is not None:
-            share = round(judged.normalized, 4)
+        curve = self._curve_of(evaluated)
+        if curve is not None and time_s is not None and evaluated.normalized is not None:
+            share = round(evaluated.normalized, 4)
             curve.add(time_s, share)
         cells = {
             name: [[round(x_m, 2), round(y_m, 2)] for x_m, y_m in cell]
@@ -227,7 +222,7 @@ class LiveMap:
         )
 
     def _curve_of(self, cost: Cost) -> Curve | None:
-        """The mission's curve; pages are told of a new one, and of its Lloyd's cost."""
+        """The mission's curve; a new one, and its Lloyd's cost, are sent to the pages."""
         began_s, curve, lloyd = self._costs.began_s, self._curve, None
         if began_s is None:
             return None
@@ -242,10 +237,8 @@ class LiveMap:
         self._put(curve.view())
         return curve
 
-    # To the pages
-
     def _put(self, view: Json, of: str = "") -> None:
-        """Tell all pages; it takes the place of what was to be told of the same kind."""
+        """Send to all pages, replacing an unsent message of the same kind."""
         if self._pages:
             text = _text(view)
             for page in self._pages:
@@ -255,7 +248,7 @@ class LiveMap:
         return {"kind": "ground", "problem": self._problem}
 
     def _welcome(self, page: Outbox) -> None:
-        """Tell a page that opens all that is known."""
+        """Send everything known to a new page."""
         page.put(_text({"kind": "hello", "fleet": self._fleet, "operate": self._operate}), "hello")
         page.put(_text(self._ground_view()), "ground")
         if self._setup is None:
@@ -288,7 +281,7 @@ class LiveMap:
         if refusal is not None:
             return web.Response(status=403, text=f"{refusal}\n", headers=_HEADERS)
         if query is not None and self._access.token is not None and request.path == "/":
-            # Out of the address, which others may see on the screen.
+            # Remove the token from the address, which others may see on the screen.
             response = web.Response(status=303, headers={**_HEADERS, "Location": "/"})
             response.set_cookie(
                 cookie, self._access.token, httponly=True, samesite="Strict",
@@ -318,7 +311,7 @@ class LiveMap:
         try:
             async for message in stream:
                 if message.type is WSMsgType.TEXT:
-                    self._take_wish(page, message.data)
+                    self._handle(page, message.data)
         finally:
             self._pages.discard(page)
             self._sockets.discard(stream)
@@ -333,15 +326,13 @@ class LiveMap:
         for task in tuple(self._tasks):
             task.cancel()
 
-    # From the pages
-
-    def _take_wish(self, page: Outbox, text: str) -> None:
-        """{"select": name or null}, or {"do": action, "robots": [names]}; anything else is none."""
+    def _handle(self, page: Outbox, text: str) -> None:
+        """Handle {"select": name or null} or {"do": action, "robots": [names]}; ignore others."""
         try:
-            wish = json.loads(text)
+            request = json.loads(text)
         except (ValueError, RecursionError):
             return
-        match wish:
+        match request:
             case {"select": str() | None as name}:
                 page.selected = name
                 self._put_detail(page)
@@ -352,7 +343,7 @@ class LiveMap:
 
     async def _act(self, page: Outbox, action: str, robots: tuple[str, ...]) -> None:
         if not self._operate:
-            text = "this map only observes: `lpac map --operate` can command"
+            text = "this map only shows the fleet: `lpac map --operate` can command"
             report = CommandReport(problem=Problem(ProblemCode.MAY_NOT, text))
         elif action not in _ACTIONS:
             text = "there is no such command here"
@@ -373,7 +364,7 @@ class LiveMap:
 async def _write(stream: web.WebSocketResponse, page: Outbox) -> None:
     while not stream.closed:
         for text in await page.take():
-            # Waits as long as the page does not take what was sent before.
+            # Waits while the page has not taken earlier messages.
             await stream.send_str(text)
 
 
@@ -397,7 +388,7 @@ def _explored_view(explored: Explored) -> Json:
 
 
 def _cookie(request: web.Request) -> str:
-    """Browsers keep cookies by name and host, whatever the port."""
+    """Cookie name with the port, since browsers share cookies between ports."""
     port = request.transport.get_extra_info("sockname")[1] if request.transport else 0
     return f"lpac-map-{port}"
 
@@ -412,10 +403,10 @@ async def serving(
     operate: bool,
     tls: ssl.SSLContext | None = None,
 ) -> AsyncIterator[list[str]]:
-    """Serve the map of a fleet as long as this context lasts; gives its addresses.
+    """Serve the map of a fleet within this context; gives its addresses.
 
-    With `tls` over TLS; the scheme of `access` is then https.
-    Port 0 takes a free one. Raises OSError if it cannot listen there.
+    With `tls`, the scheme of `access` must be https. Port 0 takes a free one. Raises OSError if it
+    cannot listen there.
     """
     live_map = LiveMap(fleet, access, operate=operate)
     runner = web.AppRunner(live_map.app(), access_log=None, shutdown_timeout=1.0)
@@ -430,7 +421,7 @@ async def serving(
         except OSError as error:
             reason = error.strerror or error
             raise OSError(f"--host {host} --port {port}: cannot serve there: {reason}") from None
-        names = [f"[{name}]" if ":" in name else name for name in reached_at(own)]
+        names = [f"[{name}]" if ":" in name else name for name in server_addresses(own)]
         query = "" if access.token is None else f"?token={access.token}"
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(live_map.follow()), group.create_task(live_map.compute())]
@@ -439,5 +430,5 @@ async def serving(
             finally:
                 for task in tasks:
                     task.cancel()
-                # Pages are told before their connections end.
+                # Close the pages' WebSockets before their connections end.
                 await runner.shutdown()

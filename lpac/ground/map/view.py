@@ -1,7 +1,6 @@
-"""Messages to the live map's page, from the ground's: JSON values, few enough for 5 Hz.
+"""JSON messages to the live map's page, small enough for 5 Hz.
 
-Pure. Positions are (x, y) or (x, y, z) in the mission frame, m; `yaw_rad` is clockwise from its y
-axis, as the map shows it.
+Pure. Positions are (x, y) or (x, y, z), mission frame, m; `yaw_rad` is clockwise from its y axis.
 """
 
 import base64
@@ -26,16 +25,16 @@ from lpac.ground.rendering import (
     problem,
     quantity,
     rows,
-    state_look,
+    state_style,
     tables,
 )
 from lpac.ground.station.protocol import CommandReport
 
 Json = dict[str, Any]
 
-# What the density is sent with: finer than a laptop shows it.
+# Resolution of the density, finer than a laptop shows.
 DENSITY_CELLS = 256
-# Cells of a robot's row; the style of a robot that is not heard.
+# Cells of a robot's row, and the style of a robot that is not heard.
 _CELLS = ("height", "battery", "satellites", "link")
 _LOST = "lost"
 _MAX_POINTS = 3000
@@ -44,7 +43,7 @@ _PATH_STEP_M = 0.15
 
 
 def setup_view(setup: FleetSetup, coverage: Coverage | None) -> Json:
-    """Values that seldom change; no density without `coverage`, as of an unknown world."""
+    """Values that seldom change. Without `coverage` (unknown world) there is no density."""
     return {
         "kind": "setup",
         "slots": [
@@ -67,7 +66,7 @@ def setup_view(setup: FleetSetup, coverage: Coverage | None) -> Json:
 
 
 def snapshot_view(setup: FleetSetup, snapshot: FleetSnapshot, alarms: tuple[Alarm, ...]) -> Json:
-    """The fleet now."""
+    """Present state of the fleet."""
     ground = snapshot.ground
     fence = ground.fence if ground is not None and ground.fence is not None else setup.fence
     heading_deg = None if ground is None or ground.origin is None else ground.origin.heading_deg
@@ -114,7 +113,7 @@ def _robot_view(
         return view
     if robot.fresh:
         view["look"] = "ready" if is_ready(status) else status.state
-        view["letter"] = state_look(status).letter
+        view["letter"] = state_style(status).letter
     return view | {
         "state": status.state,
         "in_air": in_air(status),
@@ -122,7 +121,7 @@ def _robot_view(
         "yaw_rad": _number(nose_rad(status, heading_deg), 3),
         "wanted_m_s": _rounded(status.policy_velocity_m_s),
         "landing_m": _rounded(status.landing_point_m),
-        # How old each neighbour's last message was then, by the neighbour's place in `robots`.
+        # [index in `robots`, age of its last message, s] of each neighbour.
         "hears": [
             [index[int(neighbour)], _number(age_s, 2) if robot.fresh else None]
             for neighbour, age_s in status.neighbour_ages_s.items()
@@ -132,7 +131,7 @@ def _robot_view(
 
 
 def detail_view(row: Row, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) -> Json:
-    """Everything about one robot."""
+    """Details of one robot."""
     return {
         "kind": "detail",
         "name": row.robot.name,
@@ -142,19 +141,19 @@ def detail_view(row: Row, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) -> J
 
 
 def report_view(action: str, report: CommandReport) -> Json:
-    """Outcome of an action."""
+    """Result of an action."""
     results = [{"done": result.done, **dataclasses.asdict(result)} for result in report.results]
     problem = report.problem and dataclasses.asdict(report.problem)
-    said = {"done": report.done, "results": results, "problem": problem}
-    return {"kind": "report", "action": action, **said}
+    outcome = {"done": report.done, "results": results, "problem": problem}
+    return {"kind": "report", "action": action, **outcome}
 
 
 @dataclass(slots=True)
 class Curve:
-    """The coverage cost of one mission: `points` are (mission time, s; J over that of the start).
+    """Coverage cost of one mission: `points` are (mission time, s; J / J at the start).
 
-    The mission began at `began_s` (Unix time), unless not `whole`: then the first snapshot showed
-    it under way. `lloyd` is over J of the start, too: of Lloyd's algorithm, which knows the world.
+    `began_s` is when the mission began, Unix time; if not `whole`, when it was first observed.
+    `lloyd` is J / J at the start of Lloyd's algorithm, which knows the world.
     """
 
     trial: str
@@ -164,13 +163,13 @@ class Curve:
     points: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, time_s: float, share: float) -> None:
-        """Of a long mission every second point is forgotten, now and then."""
+        """Add a point; every second one is dropped when there are too many."""
         if len(self.points) >= _MAX_POINTS:
             del self.points[1::2]
         self.points.append((round(time_s, 2), share))
 
     def view(self) -> Json:
-        """All of it."""
+        """The message."""
         return {"kind": "curve", **dataclasses.asdict(self)}
 
 
@@ -181,11 +180,11 @@ class Paths:
         self._paths: dict[str, deque[tuple[float, float]]] = {}
 
     def clear(self) -> None:
-        """Another mission begins."""
+        """Start a new mission."""
         self._paths.clear()
 
     def take(self, snapshot: FleetSnapshot, places_m: Mapping[str, tuple[float, float]]) -> None:
-        """Take where robots are; only those in the air leave a path."""
+        """Extend the paths of robots in the air."""
         for robot in snapshot.robots:
             if robot.name not in places_m or robot.status is None or not in_air(robot.status):
                 continue
@@ -195,7 +194,7 @@ class Paths:
                 path.append((round(place_m[0], 2), round(place_m[1], 2)))
 
     def view(self) -> Json:
-        """All of them, for a page that opens."""
+        """The message with all paths, for a new page."""
         return {"kind": "paths", "paths": {name: list(p) for name, p in self._paths.items()}}
 
 

@@ -1,4 +1,4 @@
-"""How commands, views and scripts speak to the ground process of this machine."""
+"""Client of this machine's ground process, for commands, views and scripts."""
 
 import asyncio
 import os
@@ -19,7 +19,7 @@ from lpac.ground.station.protocol import (
     to_line,
 )
 
-# The ground process says something at least once a second, unless it hangs.
+# Unless it hangs, the ground process sends something at least once a second.
 _PATIENCE_S = 5.0
 # Worlds are the longest lines.
 MAX_LINE = 1 << 26
@@ -27,18 +27,18 @@ _MAX_PATH = 103  # macOS; Linux has a few more
 
 
 class GroundError(OSError):
-    """No ground process runs for the fleet, it has ended or hangs; the text says what to do."""
+    """The ground process does not run, has ended or hangs. The message says what to do."""
 
 
 def socket_path(fleet: str) -> Path:
-    """Path of the socket on which the fleet's ground process listens, for this user alone.
+    """Path of the ground process's socket, in a folder of this user alone.
 
-    Raises GroundError if the folder could be somebody else's.
+    Raises GroundError if others can write to the folder, or the path is too long.
     """
     folder = os.environ.get("XDG_RUNTIME_DIR") or _own_folder()
     path = Path(folder, f"lpac-ground-{fleet}.sock")
     if len(os.fsencode(path)) > _MAX_PATH:
-        raise GroundError(f"{path}: is too long for a socket: set XDG_RUNTIME_DIR to a short path")
+        raise GroundError(f"{path}: too long for a socket: set XDG_RUNTIME_DIR to a short path")
     return path
 
 
@@ -48,41 +48,41 @@ def command(
     on_progress: Callable[[CommandProgress], None] = lambda _: None,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> CommandReport:
-    """Have a command done, and wait for what came of it; `meanwhile` is called once a second.
+    """Run a command and wait for its report; `meanwhile` is called once a second.
 
-    Whoever leaves before, as by Ctrl-C, abandons what is not ordered yet. Raises GroundError.
+    Leaving early, as by Ctrl-C, abandons what is not ordered yet. Raises GroundError.
     """
     with _connected(fleet, to_line(request)) as answers:
-        for told in answers:
+        for answer in answers:
             meanwhile()
-            if isinstance(told, CommandReport):
-                return told
-            if isinstance(told, CommandProgress) and told.text:
-                on_progress(told)
-    raise AssertionError("it ends by a report or an error")
+            if isinstance(answer, CommandReport):
+                return answer
+            if isinstance(answer, CommandProgress) and answer.text:
+                on_progress(answer)
+    raise AssertionError("answers end with a report or an error")
 
 
 @contextmanager
 def subscribe(fleet: str) -> Iterator[Iterator[ServerMessage]]:
     """Messages of the ground process from now on. Raises GroundError, also when it ends."""
-    with _connected(fleet, SUBSCRIBE) as told:
-        yield told
+    with _connected(fleet, SUBSCRIBE) as messages:
+        yield messages
 
 
 async def send(fleet: str, request: Request) -> CommandReport:
-    """`command` for views."""
+    """`command` for asyncio, without progress."""
     async with aclosing(_answers(fleet, to_line(request))) as answers:
-        async for told in answers:
-            if isinstance(told, CommandReport):
-                return told
-    raise AssertionError("it ends by a report or an error")
+        async for answer in answers:
+            if isinstance(answer, CommandReport):
+                return answer
+    raise AssertionError("answers end with a report or an error")
 
 
 async def listen(fleet: str) -> AsyncIterator[ServerMessage]:
     """`subscribe` for asyncio."""
-    async with aclosing(_answers(fleet, SUBSCRIBE)) as answers:
-        async for told in answers:
-            yield told
+    async with aclosing(_answers(fleet, SUBSCRIBE)) as messages:
+        async for message in messages:
+            yield message
 
 
 @contextmanager
@@ -124,13 +124,13 @@ async def _answers(fleet: str, line: bytes) -> AsyncGenerator[ServerMessage]:
 
 @contextmanager
 def _ground_errors(fleet: str) -> Iterator[None]:
-    """Raises GroundError for what a socket raises."""
+    """Turn a socket's exceptions into GroundError."""
     try:
         yield
     except (FileNotFoundError, ConnectionRefusedError):
         text = f"no ground station runs for fleet {fleet} here: start `lpac ground`"
         raise GroundError(text) from None
-    except (TimeoutError, BlockingIOError):  # More wait for it than it may have waiting.
+    except (TimeoutError, BlockingIOError):  # Its backlog is full.
         raise no_answer(fleet) from None
     except ConnectionError:
         raise _ended(fleet) from None
@@ -141,12 +141,12 @@ def _own_folder() -> Path:
     folder.mkdir(mode=0o700, exist_ok=True)
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise GroundError(f"{folder}: must be a folder of this user alone: remove it")
+        raise GroundError(f"{folder}: others can write to it: remove it")
     return folder
 
 
 def no_answer(fleet: str) -> GroundError:
-    """It is there, and says nothing."""
+    """Error of a ground process that hangs."""
     return GroundError(
         f"the ground station of fleet {fleet} does not answer: end it, and start `lpac ground` "
         "again"

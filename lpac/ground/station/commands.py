@@ -1,7 +1,7 @@
-"""Commands of clients: each is stepped until every robot has done it, or has not.
+"""Clients' commands; each is stepped until every robot has succeeded or failed.
 
-Pure, like the station: a command is a generator that looks at the station, changes what it wants,
-and yields whenever it has to wait for what comes next.
+Pure, like the station. A command is a generator that reads and changes the station, and yields
+whenever it has to wait for messages or time.
 """
 
 import math
@@ -42,22 +42,23 @@ from lpac.ground.station.protocol import (
     command_name,
     in_words,
 )
+from lpac.ground.station.states import next_trial
 from lpac.ground.station.station import Station, is_down
-from lpac.ground.station.wishes import next_trial
+from lpac.ground.station.statuses import TWO_PROGRAMS
 
 DEFECT = Problem(ProblemCode.DEFECT, "a defect of lpac ground ended this command")
 
 _GATHER_S = 3.0
-# Until a robot has obeyed; then, until what it was told shows.
+# Timeouts for a robot to obey a state, and then for its effect to show in its status.
 _OBEY_S = 10.0
-_TAKE_UP_S = 3.0
+_EFFECT_S = 3.0
 _ACT_S = 1.5
-# A world is long, and computed with.
+# A world takes long to send and to process.
 _WORLD_S = 30.0
-# From idle, or after a landing, until all checks have been run.
+# For all checks to run, after a landing and from idle.
 _READY_S = 8.0
 _CHECKS_S = 20.0
-# What keeps a robot in hold from starting is often that it has not heard yet that all hold.
+# A robot often refuses a start only because it has not heard yet that all others hold.
 _START_S = 6.0
 _START_AGAIN_S = 0.5
 _CLIMB_S = 90.0
@@ -68,13 +69,13 @@ _S, _C = FlightState, ResultCode
 _NOT_HEARD = _C.NOT_HEARD, NOT_HEARD
 _NOT_ENABLED = "not enabled: `lpac mission enable`"
 
-Waits = Generator[None, None, None]
-# What a robot does in words, once it has done what it was told; None before.
+Steps = Generator[None, None, None]
+# Describes a robot once its status shows the wanted effect; None before.
 Effect = Callable[[RobotStatus], str | None]
 
 
 class _ProblemError(Exception):
-    """Nothing of the command is done."""
+    """The command is refused as a whole."""
 
     def __init__(self, code: ProblemCode, text: str) -> None:
         super().__init__(text)
@@ -82,26 +83,26 @@ class _ProblemError(Exception):
 
 
 class CommandTask:
-    """One command that runs: `text` in words, for the robots `names`, until there is a `report`."""
+    """Running command for the robots `names`, until there is a `report`."""
 
     def __init__(
-        self, station: Station, request: Request, on_taken: Callable[["CommandTask"], None]
+        self, station: Station, request: Request, on_accepted: Callable[["CommandTask"], None]
     ) -> None:
-        """`on_taken` is called once the command is known to be possible, before it does a thing."""
+        """`on_accepted` is called when the command has passed its checks, before it acts."""
         self.request = request
         self.text = in_words(request)
         self.name = command_name(request)
         self.names = _addressed(station, request)
         self.report: CommandReport | None = None
         self._station = station
-        self._on_taken = on_taken
+        self._on_accepted = on_accepted
         self._results: dict[str, RobotResult] = {}
-        self._news: list[CommandProgress] = []
+        self._progress: list[CommandProgress] = []
         self._orders: dict[str, str] = {}
         self._steps = self._run()
 
     def step(self) -> None:
-        """Go on as far as is possible now."""
+        """Continue as far as possible now."""
         if self.report is not None:
             return
         try:
@@ -111,14 +112,14 @@ class CommandTask:
         except _ProblemError as error:
             self.report = CommandReport(problem=error.problem)
             text = f"{self.text}: {error.problem.text}"
-            self._station.tell("refusal", "", text, self._station.operator)
+            self._station.notify("refusal", "", text, self._station.operator)
         except Exception:
-            # It goes no further; the others, and the station, do.
+            # End this command only; other commands and the station go on.
             self.report = CommandReport(problem=DEFECT)
             raise
 
     def abandon(self, why: str, *, withdraw: bool) -> None:
-        """Order nothing more; `withdraw` what was ordered and is not answered."""
+        """Give no more orders; with `withdraw`, also stop repeating those not yet answered."""
         if self.report is not None:
             return
         self._steps.close()
@@ -128,74 +129,72 @@ class CommandTask:
         self._fail(self._open, _C.ABANDONED, f"abandoned: {why}")
         self._end()
 
-    def news(self) -> list[CommandProgress]:
+    def new_progress(self) -> list[CommandProgress]:
         """Progress since the last call."""
-        news, self._news = self._news, []
-        return news
+        progress, self._progress = self._progress, []
+        return progress
 
-    def _run(self) -> Waits:
+    def _run(self) -> Steps:
         station = self._station
         robots = station.setup.robots
         for name in self.names:
             if name not in robots:
                 text = f"robot {name!r} is unknown; known are {', '.join(robots)}"
                 raise _ProblemError(ProblemCode.UNKNOWN_ROBOT, text)
-        while not station.election.listened or not (self.name in _URGENT or self._are_gathered()):
+        while not station.election.is_settled or not (self.name in _URGENT or self._all_received()):
             yield
-        # Who sits in a slot is known only now.
+        # Only now the robots' slots are known.
         self.names = _addressed(station, self.request)
         if not self.names:
-            raise _ProblemError(ProblemCode.NO_ROBOT, "no robot is named, or sits in a slot")
+            raise _ProblemError(ProblemCode.NO_ROBOT, "no robot is named, and none has a slot")
         do, check = _DO[type(self.request)]
         try:
-            self._refuse_who_may_not()
+            self._require_permission()
             if check is not None:
                 check(self, self.request)
         except _ProblemError:
             if not self._is_missing_world():
                 raise
-            do = CommandTask._learn_world
-        self._on_taken(self)
-        station.tell("command", "", self.text, station.operator)
+            do = CommandTask._restore_world
+        self._on_accepted(self)
+        station.notify("command", "", self.text, station.operator)
         yield from do(self, self.request)
 
-    def _are_gathered(self) -> bool:
-        """Whether all are heard, as far as they will be: the station may just have started."""
+    def _all_received(self) -> bool:
+        """Whether all robots are heard, or 3 s have passed since the station started."""
         station = self._station
         return station.age_s > _GATHER_S or all(self._status(name) for name in self.names)
 
-    def _refuse_who_may_not(self) -> None:
-        """Raises _ProblemError if this station's operator may not ask for it."""
+    def _require_permission(self) -> None:
+        """Raises _ProblemError if this station's operator may not give the command."""
         station = self._station
         commander = station.election.commander
         if not station.election.may_command and self.name != "hold":
-            text = f"{station.operator} is an observer of this fleet: it may ask for hold alone"
+            text = f"{station.operator} is an observer of this fleet: it may only command hold"
             raise _ProblemError(ProblemCode.MAY_NOT, text)
         if not station.is_member and isinstance(self.request, (Takeoff, Start)):
             text = (
-                f"the key of {station.operator} is not in the list of members: it needs a new one "
-                "(`lpac fleet rotate`, or `lpac fleet operator`)"
+                f"the key of {station.operator} is not in the list of members: make a new one "
+                "(`lpac fleet rotate` or `lpac fleet operator`)"
             )
             raise _ProblemError(ProblemCode.MAY_NOT, text)
         own = station.commands or commander in ("", station.operator)
-        if own or self.name in _EVERYBODYS:
+        if own or self.name in _ANY_STATION:
             return
         silent = station.election.commander_age_s > COMMANDER_SILENT_S
         raise _ProblemError(
             ProblemCode.OTHER_COMMANDS,
-            f"{commander} commands the fleet{', and is silent' if silent else ''}: "
+            f"{commander} commands the fleet{' but is silent' if silent else ''}: "
             "`lpac mission command` takes over",
         )
 
-    # Results
-
     @property
     def _open(self) -> list[str]:
-        """Robots whose result is not known yet."""
+        """Robots without a result yet."""
         return [name for name in self.names if name not in self._results]
 
-    def _say(self, robot: str, text: str) -> None:
-        self._news.append(CommandProgress(robot, text))
+    def _report_progress(self, robot: str, text: str) -> None:
+        self._progress.append(CommandProgress(robot, text))
 
     def _settle(
         self,
@@ -205,8 +204,8 @@ class CommandTask:
         refusal: RefusalCode | None = None,
     ) -> None:
         self._results[robot] = RobotResult(robot, code, text, refusal)
-        self._say(robot, text)
-        self._station.tell(
+        self._report_progress(robot, text)
+        self._station.notify(
             "result" if code is _C.DONE else "refusal",
             robot,
             f"{self.text}: {text}",
@@ -223,22 +222,20 @@ class CommandTask:
     def _end(self) -> None:
         self.report = CommandReport(tuple(self._results[name] for name in self.names))
 
-    # What is known of the robots
-
     def _status(self, name: str) -> RobotStatus | None:
-        return self._station.lately(name)
+        return self._station.recent_status(name)
 
-    def _heard(self) -> dict[str, RobotStatus]:
-        """The open ones that are heard; the others have failed."""
+    def _open_statuses(self) -> dict[str, RobotStatus]:
+        """Statuses of the open robots; those that are not heard fail."""
         heard = {name: status for name in self._open if (status := self._status(name))}
         self._fail([name for name in self._open if name not in heard], *_NOT_HEARD)
         return heard
 
-    def _each(self, look: Callable[[str, RobotStatus], None]) -> Waits:
-        """Look at each open robot that is heard, again and again until all are settled."""
-        while heard := self._heard():
+    def _for_each_robot(self, check: Callable[[str, RobotStatus], None]) -> Steps:
+        """Call `check` for each open robot, repeatedly, until all have results."""
+        while heard := self._open_statuses():
             for name, status in heard.items():
-                look(name, status)
+                check(name, status)
             if self._open:
                 yield
 
@@ -246,23 +243,21 @@ class CommandTask:
         commander = self._station.election.commander
         return status.operator == commander and status.obeyed_sequence >= sequence
 
-    def _not_obeying(self, status: RobotStatus) -> tuple[ResultCode, str]:
+    def _disobedience(self, status: RobotStatus) -> tuple[ResultCode, str]:
         other = status.operator and status.operator != self._station.election.commander
-        text = f"obeys {status.operator}" if other else "does not hear this station"
+        text = f"obeys {status.operator}" if other else "does not hear this ground station"
         return _C.NOT_OBEYING, text
 
     def _ids(self) -> list[int]:
         return [self._station.setup.robots[name] for name in self.names]
 
     @property
-    def _those(self) -> list[int] | None:
-        """The robots by id; None for the fleet."""
+    def _addressed_ids(self) -> list[int] | None:
+        """Ids of the named robots; None for the fleet."""
         return self._ids() if getattr(self.request, "robots", ()) else None
 
-    # Desired state
-
     def _refuse_armed(self, _: Request) -> None:
-        """Whoever is addressed: the mission frame, fence, world and places are the fleet's."""
+        """Refuse if any robot of the fleet is armed, even one that is not addressed."""
         robots = self._station.setup.robots
         armed = [name for name in robots if (s := self._status(name)) and not is_down(s)]
         if armed:
@@ -270,85 +265,85 @@ class CommandTask:
             text = f"{', '.join(armed)} {verb} armed: land and disarm first"
             raise _ProblemError(ProblemCode.ARMED, text)
 
-    def _take_up(self, sequence: int, effect: Effect, patience_s: float = _TAKE_UP_S) -> Waits:
-        """Wait until each robot has obeyed that state, and has taken up what it says."""
+    def _await_effect(self, sequence: int, effect: Effect, timeout_s: float = _EFFECT_S) -> Steps:
+        """Wait until each robot obeys the state of that sequence and shows the effect."""
         assigned = isinstance(self.request, SetOrigin | SetFence | SetWorld | SetPlaces)
         began_s = self._station.now_s
         obeyed_s: dict[str, float] = {}
 
-        def look(name: str, status: RobotStatus) -> None:
+        def check(name: str, status: RobotStatus) -> None:
             now_s = self._station.now_s
             if not self._obeys(status, sequence):
                 if now_s - began_s > _OBEY_S:
-                    self._fail([name], *self._not_obeying(status))
+                    self._fail([name], *self._disobedience(status))
                 return
             obeyed_s.setdefault(name, now_s)
-            how = effect(status)
-            if how is not None:
-                self._settle(name, how)
-            elif not assigned and status.state in _NOT_STEERED:
-                self._fail([name], *_why(status))
-            elif now_s - obeyed_s[name] > patience_s:
-                code, text = _why(status)
+            done = effect(status)
+            if done is not None:
+                self._settle(name, done)
+            elif not assigned and status.state in _NOT_CONTROLLED:
+                self._fail([name], *_explain(status))
+            elif now_s - obeyed_s[name] > timeout_s:
+                code, text = _explain(status)
                 if assigned and status.not_taken:
                     code, text = _C.NOT_TAKEN_UP, texts(status.not_taken)
                 withdraw = isinstance(self.request, SetFence) and self.request.fence is not None
                 help_ = "; `lpac mission fence on` withdraws it" if withdraw else ""
                 self._fail([name], code, f"{text}{help_}")
 
-        yield from self._each(look)
+        yield from self._for_each_robot(check)
 
-    def _origin(self, request: SetOrigin) -> Waits:
-        yield from self._take_up(
+    def _origin(self, request: SetOrigin) -> Steps:
+        yield from self._await_effect(
             self._station.change(origin=request.origin),
-            lambda status: "taken up" if status.origin == request.origin else None,
+            lambda status: "accepted" if status.origin == request.origin else None,
         )
 
-    def _fence(self, request: SetFence) -> Waits:
+    def _fence(self, request: SetFence) -> Steps:
         fence = self._station.setup.fence if request.fence is None else request.fence
-        own = "its configured one" if request.fence is None else "taken up"
+        own = "its configured one" if request.fence is None else "accepted"
 
         def effect(status: RobotStatus) -> str | None:
             if status.fence == fence:
                 return own
-            # A robot's own file may say otherwise than the fleet's.
-            others = not any(each.code in FENCE_NOT_TAKEN for each in status.not_taken)
-            return own if request.fence is None and others else None
+            # A robot's own configuration may have another fence than the fleet's.
+            accepted = not any(each.code in FENCE_NOT_TAKEN for each in status.not_taken)
+            return own if request.fence is None and accepted else None
 
-        yield from self._take_up(self._station.change(fence=request.fence), effect)
+        yield from self._await_effect(self._station.change(fence=request.fence), effect)
 
-    def _world(self, request: SetWorld) -> Waits:
-        yield from self._have_world(self._station.set_world(request.text), request)
+    def _world(self, request: SetWorld) -> Steps:
+        yield from self._await_world(self._station.set_world(request.text), request)
 
-    def _have_world(self, sequence: int, request: SetWorld) -> Waits:
+    def _await_world(self, sequence: int, request: SetWorld) -> Steps:
         wanted = world_id(request.text)
-        yield from self._take_up(
+        yield from self._await_effect(
             sequence,
             lambda status: f"has world {wanted}" if status.world_id == wanted else None,
             _WORLD_S,
         )
 
     def _is_missing_world(self) -> bool:
-        """Whether it is the world that the fleet has, and this station lacks."""
+        """Whether the request has the fleet's world, which this station lacks."""
         setup, request = self._station.setup, self.request
         if not isinstance(request, SetWorld) or setup.world:
             return False
         return world_id(request.text) == setup.world_id
 
-    def _learn_world(self, request: SetWorld) -> Waits:
-        """Of the fleet nothing changes."""
-        self._station.worlds.remember(request.text)
-        yield from self._have_world(0, request)
+    def _restore_world(self, request: SetWorld) -> Steps:
+        """Add the fleet's world to this station; nothing changes for the robots."""
+        self._station.worlds.add(request.text)
+        yield from self._await_world(0, request)
 
-    def _places(self, request: SetPlaces) -> Waits:
+    def _places(self, request: SetPlaces) -> Steps:
         setup = self._station.setup
         places = {setup.robots[name]: place for name, place in request.places.items()}
 
         def effect(status: RobotStatus) -> str | None:
             place = places[status.robot_id]
             height_m = setup.base_height_m + place.slot * setup.slot_spacing_m
-            there = abs(status.slot_height_m - height_m) < 0.01
-            if status.landing_point_m != place.landing_point_m or not there:
+            at_height = abs(status.slot_height_m - height_m) < 0.01
+            if status.landing_point_m != place.landing_point_m or not at_height:
                 return None
             return f"slot {place.slot}, {height_m:g} m high"
 
@@ -357,7 +352,7 @@ class CommandTask:
         others = {robot: place for robot, place in before.items() if place.slot not in taken}
         given = {str(robot): place for robot, place in places.items()}
         sequence = self._station.change(places=others | given)
-        yield from self._take_up(sequence, effect)
+        yield from self._await_effect(sequence, effect)
 
     def _check_places(self, request: SetPlaces) -> None:
         self._refuse_armed(request)
@@ -373,17 +368,17 @@ class CommandTask:
             text = "no mission origin: set it with `lpac mission origin`"
             raise _ProblemError(ProblemCode.NO_ORIGIN, text)
 
-    def _enable(self, request: Enable) -> Waits:
+    def _enable(self, request: Enable) -> Steps:
         station = self._station
-        if self._those is None:
+        if self._addressed_ids is None:
             sequence = station.change(enabled=request.on, robot_enabled={})
         else:
             before = {} if station.state is None else station.state.robot_enabled
-            these = dict.fromkeys(map(str, self._those), request.on)
+            these = dict.fromkeys(map(str, self._addressed_ids), request.on)
             sequence = station.change(robot_enabled=before | these)
 
         def on(status: RobotStatus) -> str | None:
-            if status.state in (_S.INIT, _S.IDLE, *_NOT_STEERED):
+            if status.state in (_S.INIT, _S.IDLE, *_NOT_CONTROLLED):
                 return None
             if status.state is not _S.PREFLIGHT:
                 return f"enabled, in {status.state}"
@@ -394,58 +389,56 @@ class CommandTask:
                 return None if status.state is _S.PREFLIGHT else "disabled"
             return "disabled: it holds" if status.state is _S.HOLD else None
 
-        yield from self._take_up(sequence, on if request.on else off, _CHECKS_S)
+        yield from self._await_effect(sequence, on if request.on else off, _CHECKS_S)
 
-    def _safety_command(self, request: SafetyCommand) -> Waits:
+    def _safety_command(self, request: SafetyCommand) -> Steps:
         station = self._station
         if request.action == "hold":
-            sequence = station.hold(self._those)
+            sequence = station.hold(self._addressed_ids)
         else:
-            sequence = station.safety_action(request.action, self._those)
+            sequence = station.safety_action(request.action, self._addressed_ids)
         if not request.wait:
-            yield from self._take_up(sequence, _obeying_words(request.action), _ACT_S)
+            yield from self._await_effect(sequence, _safety_effect(request.action), _ACT_S)
             return
-        yield from self._obeyed(sequence)
+        yield from self._await_obedience(sequence)
         known: dict[str, RobotStatus] = {}
         changed_s = station.now_s
 
-        def look(name: str, status: RobotStatus) -> None:
+        def check(name: str, status: RobotStatus) -> None:
             nonlocal changed_s
             flown = known.get(name)
             if is_down(status):
                 self._settle(name, *_came_down(request.action, flown, status))
-            elif status.state in _NOT_STEERED:
-                self._fail([name], *_why(status))
+            elif status.state in _NOT_CONTROLLED:
+                self._fail([name], *_explain(status))
             elif flown is None or (flown.state, flown.reason) != (status.state, status.reason):
                 known[name], changed_s = status, station.now_s
-                self._say(name, state_and_reason(status))
+                self._report_progress(name, state_and_reason(status))
             elif station.now_s - changed_s > _LANDING_S:
-                self._fail([name], *_why(status))
+                self._fail([name], *_explain(status))
 
-        yield from self._each(look)
+        yield from self._for_each_robot(check)
 
-    def _obeyed(self, sequence: int = 0) -> Waits:
-        """Each robot obeys that state, or has failed: what it said before counts no more."""
+    def _await_obedience(self, sequence: int = 0) -> Steps:
+        """Wait until each robot obeys the state of that sequence; after 10 s the others fail."""
         until_s = self._station.now_s + _OBEY_S
-        while heard := self._heard():
-            deaf = {n: s for n, s in heard.items() if not self._obeys(s, sequence)}
-            if deaf and self._station.now_s > until_s:
-                for name, status in deaf.items():
-                    self._fail([name], *self._not_obeying(status))
-                deaf = {}
-            if not deaf:
+        while statuses := self._open_statuses():
+            others = {n: s for n, s in statuses.items() if not self._obeys(s, sequence)}
+            if others and self._station.now_s > until_s:
+                for name, status in others.items():
+                    self._fail([name], *self._disobedience(status))
+                others = {}
+            if not others:
                 return
             yield
 
-    # Orders
-
-    def _reach(self) -> Waits:
-        """Before orders: each robot obeys this station, or has failed."""
+    def _reach_robots(self) -> Steps:
+        """Take command and wait until each robot obeys it; required before orders."""
         station = self._station
         station.election.take_command()
-        yield from self._obeyed()
-        twice = [name for name in self._open if station.is_duplicate(name)]
-        self._fail(twice, _C.DUPLICATE_ID, "two programs say that they are this robot")
+        yield from self._await_obedience()
+        duplicates = [name for name in self._open if station.is_duplicate(name)]
+        self._fail(duplicates, _C.DUPLICATE_ID, TWO_PROGRAMS)
 
     def _order(self, kind: OrderKind, name: str, trial: str = "") -> None:
         order_id = self._station.order(kind, name, trial)
@@ -454,8 +447,7 @@ class CommandTask:
         else:
             self._orders[name] = order_id
 
-    def _answers(self, done: str) -> Waits:
-        """Wait for the robots' answers to their orders."""
+    def _answers(self, done: str) -> Steps:
         while self._open:
             for name in self._open:
                 answer = self._station.orders.results.get(self._orders[name])
@@ -468,7 +460,7 @@ class CommandTask:
                 yield
 
     def _under_safety_action(self) -> dict[str, str]:
-        """Why the open ones that are asked to hold, return or land are not to be set in motion."""
+        """Open robots that are commanded to hold, return or land, with the reason in words."""
         state, robots = self._station.state, self._station.setup.robots
         if state is None:
             return {}
@@ -489,66 +481,66 @@ class CommandTask:
         state = self._station.state
         if state is not None and not any(map(state.enabled_for, self._ids())):
             raise _ProblemError(ProblemCode.NOT_ENABLED, _NOT_ENABLED)
-        if not self._brought_down(self.names):
+        if not self._all_down(self.names):
             self._refuse_under_safety_action(request)
 
-    def _brought_down(self, names: Collection[str]) -> bool:
-        """Whether all are down who are asked to return or to land, and nobody is asked to hold.
+    def _all_down(self, names: Collection[str]) -> bool:
+        """Whether a return or landing of these robots is over: all are down, and none holds.
 
-        Who is not heard, and should be, may be in the air.
+        An addressed or flying robot that is not heard may be in the air.
         """
         station = self._station
         state, robots = station.state, station.setup.robots
-        awaited = {*self.names, *station.flying}
+        expected = {*self.names, *station.flying}
         return state is not None and all(
             state.safety_action_for(robots[name]) != "hold"
-            and (name not in awaited if (s := self._status(name)) is None else is_down(s))
+            and (name not in expected if (s := self._status(name)) is None else is_down(s))
             for name in names
         )
 
-    def _take_off(self, request: Takeoff) -> Waits:
+    def _take_off(self, request: Takeoff) -> Steps:
         station = self._station
-        # What brought the robots down before does not keep them there; somebody's hold does.
-        if self._under_safety_action() and self._brought_down(self.names):
-            whole = self._brought_down(station.setup.robots)
-            station.safety_action("none", None if whole else self._ids())
+        # A finished return or landing is withdrawn; a hold is not.
+        if self._under_safety_action() and self._all_down(self.names):
+            all_down = self._all_down(station.setup.robots)
+            station.safety_action("none", None if all_down else self._ids())
         for name, why in self._under_safety_action().items():
             self._fail([name], _C.UNDER_SAFETY_ACTION, why)
-        yield from self._reach()
-        self._settle_who_does_not_take_off()
+        yield from self._reach_robots()
+        self._settle_others()
         waiting = sorted(self._open, key=self._height_m)
         ordered_s: dict[str, float] = {}
         ready_by_s, next_s = station.now_s + _READY_S, station.now_s
         while self._open:
-            self._look_at_climbs(ordered_s)
+            self._check_climbs(ordered_s)
             failed = [result.robot for result in self._results.values() if not result.done]
             if failed and request.abort_on_failure:
                 self._fail(waiting, _C.NOT_ORDERED, f"not ordered: {failed[0]} failed")
                 waiting.clear()
-            # The highest first: it climbs past nobody.
+            # The highest first, so that no robot climbs past another.
             if waiting and station.status(waiting[-1]) is None:
-                # Who falls silent may come back, and then runs its checks again.
+                # A silent robot may come back, and then runs its checks again.
                 ready_by_s = station.now_s + _READY_S
             if waiting and station.now_s >= next_s:
-                decided = self._order_takeoff(waiting[-1], late=station.now_s >= ready_by_s)
-                if decided is not None:
+                ordered = self._order_takeoff(waiting[-1], late=station.now_s >= ready_by_s)
+                if ordered is not None:
                     name = waiting.pop()
-                    if decided:
+                    if ordered:
                         ordered_s[name] = station.now_s
                         next_s = station.now_s + request.interval_s
             if self._open:
                 yield
 
-    def _settle_who_does_not_take_off(self) -> None:
-        for name, status in self._heard().items():
+    def _settle_others(self) -> None:
+        for name, status in self._open_statuses().items():
             if status.state in (_S.HOLD, _S.MISSION):
-                self._settle_up(name, status, f"already in the air, in {status.state}")
+                self._settle_climb(name, status, f"already in the air, in {status.state}")
             elif not self._is_enabled(name):
                 self._fail([name], _C.NOT_ENABLED, _NOT_ENABLED)
-            elif status.state in _NOT_STEERED:
-                self._fail([name], *_why(status))
+            elif status.state in _NOT_CONTROLLED:
+                self._fail([name], *_explain(status))
             elif not status.ready:
-                self._say(name, _why(status)[1])
+                self._report_progress(name, _explain(status)[1])
 
     def _is_enabled(self, name: str) -> bool:
         state = self._station.state
@@ -559,7 +551,7 @@ class CommandTask:
         return 0.0 if status is None else status.slot_height_m
 
     def _order_takeoff(self, name: str, *, late: bool) -> bool | None:
-        """Whether it was ordered, as the robot is ready; None if that is to be waited for."""
+        """Order takeoff if the robot is ready. True: ordered, False: failed, None: wait."""
         status = self._status(name)
         if status is None:
             self._fail([name], *_NOT_HEARD)
@@ -567,21 +559,21 @@ class CommandTask:
             return None
         elif status.state is _S.PREFLIGHT and status.ready:
             self._order("takeoff", name)
-            self._say(name, "takes off")
+            self._report_progress(name, "taking off")
             return True
         elif late:
-            self._fail([name], *_why(status))
+            self._fail([name], *_explain(status))
         else:
             return None
         return False
 
-    def _look_at_climbs(self, ordered_s: Mapping[str, float]) -> None:
+    def _check_climbs(self, ordered_s: Mapping[str, float]) -> None:
         for name, at_s in ordered_s.items():
             if name in self._open:
-                self._look_at_climb(name, at_s)
+                self._check_climb(name, at_s)
 
-    def _look_at_climb(self, name: str, ordered_s: float) -> None:
-        """Settle a takeoff that is over."""
+    def _check_climb(self, name: str, ordered_s: float) -> None:
+        """Record the result of a takeoff that is over."""
         status = self._status(name)
         answer = self._station.orders.results.get(self._orders[name])
         late = self._station.now_s - ordered_s > _CLIMB_S
@@ -591,33 +583,33 @@ class CommandTask:
             self._fail([name], *_NOT_HEARD)
         elif late or (answer is not None and status.state not in _CLIMBING):
             if status.state in (_S.HOLD, _S.MISSION):
-                self._settle_up(name, status, status.reason.text)
+                self._settle_climb(name, status, status.reason.text)
             else:
                 self._fail([name], _C.WRONG_STATE, state_and_reason(status))
 
-    def _settle_up(self, name: str, status: RobotStatus, text: str) -> None:
-        """Settle who has taken off; who was held up on its way is too low for a mission."""
+    def _settle_climb(self, name: str, status: RobotStatus, text: str) -> None:
+        """Record the result of a robot in the air; one that stopped climbing early is too low."""
         low = status.state is _S.HOLD and is_too_low(status)
         if low:
             text += f"; below its height of {status.slot_height_m:g} m: land all, then take off"
         self._settle(name, text, _C.TOO_LOW if low else _C.DONE)
 
-    def _start(self, _: Start) -> Waits:
+    def _start(self, _: Start) -> Steps:
         for name, why in self._under_safety_action().items():
             self._fail([name], _C.UNDER_SAFETY_ACTION, why)
-        yield from self._reach()
+        yield from self._reach_robots()
         state = self._station.state
         trial = state.trial if state is not None and state.trial else next_trial("")
         self._station.change(trial=trial)
         yield from self._order_start(trial)
 
-    def _order_start(self, trial: str) -> Waits:
-        """Order it; again, for a while, if a robot refuses because of the moment."""
+    def _order_start(self, trial: str) -> Steps:
+        """Order start; repeat it for a while if a robot refuses for a passing reason."""
         until_s = self._station.now_s + _START_S
         again_s: dict[str, float] = {}
         refusals: dict[str, Refusal] = {}
 
-        def look(name: str, status: RobotStatus) -> None:
+        def check(name: str, status: RobotStatus) -> None:
             nonlocal until_s
             now_s = self._station.now_s
             order_id = self._orders.get(name, "")
@@ -630,40 +622,40 @@ class CommandTask:
             if status.state is _S.MISSION and status.trial == trial:
                 self._settle(name, f"flies the mission, trial {trial}")
             elif now_s > until_s or status.state not in (_S.HOLD, _S.TAKEOFF):
-                # Who has left hold since then is where it is for another reason.
+                # A robot that has left hold since its refusal has another reason.
                 if name in refusals and status.state is _S.HOLD:
                     self._refuse(name, refusals[name])
                 else:
                     rule = "" if status.state is _S.HOLD else "start is from hold: "
-                    code, text = _why(status)
+                    code, text = _explain(status)
                     self._fail([name], code, f"{rule}{text}")
             elif self._station.status(name) is None:
                 until_s = now_s + _START_S
             elif not order_id and status.state is _S.HOLD and now_s >= again_s.get(name, 0.0):
                 self._order("start", name, trial)
 
-        yield from self._each(look)
+        yield from self._for_each_robot(check)
 
-    def _resume(self, _: Resume) -> Waits:
+    def _resume(self, _: Resume) -> Steps:
         station = self._station
-        yield from self._reach()
-        yield from self._stop_homeward()
-        yield from self._obeyed(station.safety_action("none", self._those))
+        yield from self._reach_robots()
+        yield from self._stop_returning()
+        yield from self._await_obedience(station.safety_action("none", self._addressed_ids))
         assert station.state is not None
         trial = station.state.trial
-        for name, status in self._heard().items():
+        for name, status in self._open_statuses().items():
             if is_down(status):
                 self._settle(name, "on the ground")
             elif status.state not in (_S.HOLD, _S.MISSION):
                 self._fail([name], _C.WRONG_STATE, state_and_reason(status))
             elif not trial or status.trial != trial:
-                self._settle(name, "holds: it has not begun this trial; `lpac mission start`")
+                self._settle(name, "holds: not in this trial yet; `lpac mission start`")
         yield from self._order_start(trial)
 
-    def _stop_homeward(self) -> Waits:
-        """From return the way to the mission leads through hold."""
+    def _stop_returning(self) -> Steps:
+        """Let returning robots hold, since a mission starts from hold."""
         station = self._station
-        homeward = {n: s for n, s in self._heard().items() if s.state is _S.RETURN}
+        homeward = {n: s for n, s in self._open_statuses().items() if s.state is _S.RETURN}
         if not homeward:
             return
         ids = [status.robot_id for status in homeward.values()]
@@ -675,7 +667,7 @@ class CommandTask:
             ):
                 yield
         except GeneratorExit:
-            # Abandoned: nobody wants them to stay, unless somebody else asked for it since.
+            # Abandoned: continue the return, unless another station has commanded hold since.
             if (
                 station.commands
                 and station.state is not None
@@ -684,17 +676,17 @@ class CommandTask:
                 station.safety_action("return", ids)
             raise
 
-    def _give(self, request: RobotCommand) -> Waits:
+    def _order_each(self, request: RobotCommand) -> Steps:
         if request.kind != "kill":
-            yield from self._reach()
-        # Who is silent is killed, too, if it still hears.
+            yield from self._reach_robots()
+        # Kill is also sent to a silent robot, which may still receive it.
         for name in self._open:
             status = self._status(name)
             if request.kind == "disarm" and status is not None and status.armed is False:
                 self._settle(name, "is not armed")
             else:
                 self._order(request.kind, name)
-        yield from self._answers(_GIVEN[request.kind])
+        yield from self._answers(_ORDER_DONE[request.kind])
 
     def _refuse_on_mission(self, _: NextTrial) -> None:
         robots = self._station.setup.robots
@@ -704,8 +696,8 @@ class CommandTask:
             text = f"{', '.join(flying)} {verb} the mission: hold or land first"
             raise _ProblemError(ProblemCode.ON_MISSION, text)
 
-    def _again(self, request: NextTrial) -> Waits:
-        yield from self._reach()
+    def _next_trial(self, request: NextTrial) -> Steps:
+        yield from self._reach_robots()
         state = self._station.state
         trial = request.trial or next_trial("" if state is None else state.trial)
         self._station.change(trial=trial)
@@ -713,38 +705,38 @@ class CommandTask:
             self._order("reset", name, trial)
         yield from self._answers(f"trial {trial}: map and neighbours' messages are reset")
 
-    def _command(self, _: TakeCommand) -> Waits:
+    def _take_command(self, _: TakeCommand) -> Steps:
         station = self._station
         until_s = station.now_s + _OBEY_S
         station.election.take_command()
 
-        def look(name: str, status: RobotStatus) -> None:
-            # Somebody else may change something at the same moment.
+        def check(name: str, status: RobotStatus) -> None:
+            # Again: another station may change its state at the same moment.
             station.election.take_command()
             if self._obeys(status):
                 self._settle(name, f"obeys {station.operator}")
             elif station.now_s > until_s:
-                self._fail([name], *self._not_obeying(status))
+                self._fail([name], *self._disobedience(status))
 
-        yield from self._each(look)
+        yield from self._for_each_robot(check)
 
 
-# A robot flies itself down in none of these, and does not stop there.
-_NOT_STEERED = (_S.PILOT, _S.FAULT)
+# The robot's program does not control the vehicle in these.
+_NOT_CONTROLLED = (_S.PILOT, _S.FAULT)
 _CLIMBING = (_S.PREFLIGHT, _S.ARMING, _S.TAKEOFF)
-_GIVEN = {
+_ORDER_DONE = {
     "pilot": "the pilot has it", "rejoin": "taken back: it holds", "disarm": "disarmed",
     "kill": "killed",
 }  # fmt: skip
-_OBEYING_WORDS = {
+_SAFETY_EFFECTS = {
     "hold": {_S.HOLD: "holds"},
     "return": {_S.RETURN: "returns", _S.LAND: "lands", _S.HOLD: "waits for those below"},
     "land": {_S.LAND: "lands"},
 }
 
-_Do = Callable[[CommandTask, Any], Waits]
+_Do = Callable[[CommandTask, Any], Steps]
 _Check = Callable[[CommandTask, Any], None]
-# What each command does, and the check that refuses it as a whole before.
+# The method of each command, and a check that may refuse the command as a whole.
 _DO: dict[type[Request], tuple[_Do, _Check | None]] = {
     SetOrigin: (CommandTask._origin, CommandTask._refuse_armed),
     SetFence: (CommandTask._fence, CommandTask._refuse_armed),
@@ -755,23 +747,20 @@ _DO: dict[type[Request], tuple[_Do, _Check | None]] = {
     Start: (CommandTask._start, CommandTask._refuse_under_safety_action),
     SafetyCommand: (CommandTask._safety_command, None),
     Resume: (CommandTask._resume, None),
-    RobotCommand: (CommandTask._give, None),
-    NextTrial: (CommandTask._again, CommandTask._refuse_on_mission),
-    TakeCommand: (CommandTask._command, None),
+    RobotCommand: (CommandTask._order_each, None),
+    NextTrial: (CommandTask._next_trial, CommandTask._refuse_on_mission),
+    TakeCommand: (CommandTask._take_command, None),
 }
-# By their names. Everybody's need no command of the fleet, or take it on the way; urgent ones do
-# not wait until all are heard.
-_EVERYBODYS = ("hold", "land", "kill", "command")
+# Commands that any station may give, and those that do not wait until all robots are heard.
+_ANY_STATION = ("hold", "land", "kill", "command")
 _URGENT = ("hold", "land", "kill")
-# These set robots in motion, or stop them. They end with another station's hold, and when one that
-# supersedes them begins for the same robots.
+# Commands that another station's hold ends, and those that end them for the same robots.
 _IN_FLIGHT = ("takeoff", "start", "hold", "return", "land", "resume")
 _SUPERSEDE = ("disable", "hold", "return", "land", "resume", "kill")
 
 
 class Commands:
-    """All commands that run on a station. A safety command is taken at any time,
-    and ends the others."""
+    """Running commands of a station. A safety command may begin at any time, and ends others."""
 
     def __init__(self, station: Station) -> None:
         self._station = station
@@ -779,7 +768,7 @@ class Commands:
 
     def begin(self, request: Request) -> CommandTask:
         """Begin a command."""
-        # What another station did before does not end this one.
+        # So that an earlier interruption does not end this one.
         self.step()
         running = CommandTask(self._station, request, self._end_others)
         running.step()
@@ -787,7 +776,7 @@ class Commands:
         return running
 
     def step(self) -> None:
-        """Time has passed, or something was heard."""
+        """Continue all commands. Call after each message and periodically."""
         why, self._station.election.interruption = self._station.election.interruption, ""
         for running in self._running:
             if why and self._is_interrupted(running):
@@ -796,18 +785,18 @@ class Commands:
         self._running = [running for running in self._running if running.report is None]
 
     def _is_interrupted(self, running: CommandTask) -> bool:
-        """Another's hold ends what sets robots in motion; a new commander all that was wanted."""
+        """Another station's hold ends flight commands; a new commander ends nearly all."""
         if self._station.commands:
             return running.name in _IN_FLIGHT
         return running.name not in ("command", "kill")
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """Those that run, in words."""
+        """Running commands, in words."""
         return tuple(running.text for running in self._running)
 
     def _end_others(self, new: CommandTask) -> None:
-        """Whatever else is wanted of the same robots' flight is so no more."""
+        """End the flight commands that `new` supersedes for the same robots."""
         if new.name not in _SUPERSEDE:
             return
         for running in self._running:
@@ -824,11 +813,11 @@ def _addressed(station: Station, request: Request) -> tuple[str, ...]:
     return named if named or isinstance(request, RobotCommand) else station.flying
 
 
-def _obeying_words(safety_action: str) -> Effect:
+def _safety_effect(safety_action: str) -> Effect:
     def effect(status: RobotStatus) -> str | None:
         if is_down(status):
             return "on the ground"
-        return _OBEYING_WORDS[safety_action].get(status.state)
+        return _SAFETY_EFFECTS[safety_action].get(status.state)
 
     return effect
 
@@ -836,9 +825,9 @@ def _obeying_words(safety_action: str) -> Effect:
 def _came_down(
     safety_action: str, flown: RobotStatus | None, status: RobotStatus
 ) -> tuple[str, ResultCode]:
-    """Say how a robot came down; `flown` is the last status of its flight, if any."""
+    """Result of a robot that is down; `flown` is the last status of its flight, if any."""
     if flown is not None and status.state is _S.FAULT:
-        code, text = _why(status)
+        code, text = _explain(status)
         return text, code
     if flown is None or safety_action != "return" or _is_home(flown, status):
         return "on the ground", _C.DONE
@@ -850,7 +839,7 @@ def _came_down(
 
 
 def _is_home(flown: RobotStatus, status: RobotStatus) -> bool:
-    """Whether it came down where return leads: at its landing point, or beside it."""
+    """Whether it landed at its landing point, or beside it on purpose."""
     if is_over_landing_point(status):
         return True
     beside = any(alarm.code is ReasonCode.LANDS_BESIDE for alarm in flown.alarms)
@@ -858,13 +847,13 @@ def _is_home(flown: RobotStatus, status: RobotStatus) -> bool:
     return chosen and flown.reason.code is ReasonCode.AT_LANDING_POINT
 
 
-def _why(status: RobotStatus) -> tuple[ResultCode, str]:
-    """Explain why a robot does not do what it was told, and what helps."""
+def _explain(status: RobotStatus) -> tuple[ResultCode, str]:
+    """Why a robot does not do what was commanded, and the remedy."""
     text = state_and_reason(status)
     if status.state is _S.PILOT:
         return _C.WRONG_STATE, f"{text}; `lpac mission rejoin` takes it back"
     if status.state is _S.FAULT and status.armed is False:
-        return _C.WRONG_STATE, f"{text}; look at it, then `lpac fleet restart`"
+        return _C.WRONG_STATE, f"{text}; inspect it, then `lpac fleet restart`"
     if status.state is _S.PREFLIGHT and not status.ready:
         return _C.NOT_READY, f"not ready: {missing_checks(status)}"
     return _C.WRONG_STATE, text

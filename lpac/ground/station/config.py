@@ -17,10 +17,9 @@ from lpac.fleet.settings import FleetConfig, load_fleet
 
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
-    """`setup` is what its clients are told, `connect` the endpoints by which zenoh reaches all
-    robots.
+    """The fleet's `setup`, the robots' zenoh endpoints, and this station's identity.
 
-    `identity` is this station's in its fleet, None where nobody has one.
+    `identity` is None in a fleet without keys.
     """
 
     setup: FleetSetup
@@ -31,16 +30,17 @@ class GroundConfig:
 def load_ground(
     path: Path, operator: str | None, *, default_name: Callable[[], str] = lambda: ""
 ) -> GroundConfig:
-    """Load the ground station's configuration of the fleet. Raises ValueError or OSError.
+    """Load the ground station's configuration from a fleet.toml. Raises ValueError or OSError.
 
-    In a fleet with keys its name is the list's, and `operator` None or just that.
+    In a fleet with keys, the station's name is the one in the list of members; `operator` must be
+    None or equal it.
     """
     config = load_fleet(path)
     identity = load_own_identity(config, operator)
     name = operator or default_name() if identity is None else identity.membership.own.name
     seated = next((slot.robot for slot in config.slots if slot.robot), None)
     if seated is None:
-        raise ValueError(f"{path}: slots: no robot sits in one")
+        raise ValueError(f"{path}: slots: no robot has one")
     robot = config.robot_config(seated)
     bundle = load_bundle(config.bundle)
     perception, training = bundle.manifest.perception, bundle.manifest.training
@@ -81,19 +81,19 @@ def load_ground(
 
 
 def load_own_identity(config: FleetConfig, operator: str | None) -> Identity | None:
-    """Of this computer, None in a fleet without keys. Raises ConfigError, OSError.
+    """Identity of this computer; None in a fleet without keys. Raises ConfigError or OSError.
 
-    `operator`: the name that it must have, where one is given.
+    `operator` is the name that it must have, if given.
     """
     if config.keys is None:
         return None
     identity = load_identity(config.keys, fleet=config.fleet, unix_s=time.time())
     own = identity.membership.own
     if own.role is Role.ROBOT:
-        raise ConfigError(f"{config.keys}: is robot {own.name}'s, not a ground station's")
+        raise ConfigError(f"{config.keys}: belongs to robot {own.name}, not to a ground station")
     if operator not in (None, own.name):
         raise ConfigError(
-            f"--name {operator!r}: the list of members calls this station {own.name!r}: leave "
+            f"--name {operator!r}: this station is {own.name!r} in the list of members: leave "
             "--name out"
         )
     return identity

@@ -1,28 +1,28 @@
-"""Echoes of the robots' statuses, by which they find out how long messages travel."""
+"""Echoes of the robots' statuses, from which robots measure the round-trip time."""
 
 import math
 
 from edge.messages.mission import Echo
-from lpac.ground.station.heard import HeardRobots
+from lpac.ground.station.statuses import RobotStatuses
 
-# Each status is echoed once or twice, less often in large fleets: clocks need no more.
-_ECHOED_S, _MOST_ECHOES = 0.5, 32
+# Enough for the robots' clocks; in large fleets robots take turns.
+_MAX_AGE_S, _MAX_ECHOES = 0.5, 32
 
 
 class Echoes:
-    """Gives each robot its turn."""
+    """Selects the statuses to echo."""
 
-    def __init__(self, robots: HeardRobots) -> None:
+    def __init__(self, robots: RobotStatuses) -> None:
         self._robots = robots
         self._echoed_at_s: dict[int, float] = {}
 
     def take(self) -> dict[str, Echo]:
-        """Echoes of those that were heard just now; if there are many, of those due longest."""
+        """Echoes of fresh statuses; if there are too many, of the robots that waited longest."""
         lasts = ((robot, self._robots.last(robot)) for robot in self._robots.names)
-        fresh = {r: last for r, last in lasts if last is not None and last[1] <= _ECHOED_S}
+        fresh = {r: last for r, last in lasts if last is not None and last[1] <= _MAX_AGE_S}
         turns = sorted(fresh, key=lambda robot: self._echoed_at_s.get(robot, -math.inf))
         echoes = {}
-        for robot in turns[:_MOST_ECHOES]:
+        for robot in turns[:_MAX_ECHOES]:
             status, held_s = fresh[robot]
             self._echoed_at_s[robot] = self._robots.now_s
             echoes[str(robot)] = Echo(

@@ -1,6 +1,6 @@
-"""One ground: its station and its commands, on a clock and a link that somebody else has.
+"""A ground station with its commands, on a clock and a link that the owner provides.
 
-`lpac ground` runs it on the real clock and the radio (`station.server`), the simulator on its own.
+`lpac ground` runs it on the real clock and radio (`station.server`), the simulator on its own.
 """
 
 import base64
@@ -34,12 +34,12 @@ from lpac.ground.station.protocol import Request, ServerMessage
 from lpac.ground.station.station import Station
 
 _WORLD_PERIOD_S = 0.5
-_AHEAD = (
-    "is not listened to: its program started more than a day from now. Either this computer's "
-    "clock is behind, or the robot's was wrong (`lpac fleet up`, then `lpac fleet restart`), or "
-    "somebody has its key (`lpac fleet revoke`)"
+_FUTURE_START = (
+    "is ignored: its program started more than a day from now. Either this computer's clock is "
+    "slow, or the robot's was fast (`lpac fleet up`, then `lpac fleet restart`), or somebody has "
+    "its key (`lpac fleet revoke`)"
 )
-_STRANGER = "flies another release, which this ground station cannot read: deploy one to all"
+_UNREADABLE = "flies another release, which this ground station cannot read: deploy one to all"
 # Ticks are not exact.
 _EARLY_S = 0.1
 
@@ -47,21 +47,20 @@ _EARLY_S = 0.1
 class GroundListener(Protocol):
     """Listener to the events at a ground."""
 
-    def told(self, message: ServerMessage) -> None:
-        """Something new that clients want to hear: a setup, an event, what was explored."""
+    def published(self, message: ServerMessage) -> None:
+        """New message for clients: a setup, an event, an explored map."""
 
-    def stepped(self) -> None:
-        """Commands went on."""
+    def progressed(self) -> None:
+        """A command may have progressed."""
 
-    def commanded(self, state: GroundState) -> None:
-        """The fleet is told something else, by this station; before robots hear of it."""
+    def state_changed(self, state: GroundState) -> None:
+        """This station's state has changed. Called before it is published."""
 
 
 class GroundNode:
-    """One ground, which one thread calls, and which speaks and hears by its guard.
+    """One ground station. For one thread; all messages pass its guard.
 
-    What raises in it is told as an event: robots that fly need it more than they need what it could
-    not do.
+    An exception in it becomes an event, and the node goes on, since flying robots need it.
     """
 
     def __init__(
@@ -76,74 +75,75 @@ class GroundNode:
         self._listener = listener
         self._names = {f"robot/{robot}": name for name, robot in setup.robots.items()}
         self._explored: dict[str, bytes] = {}
-        self._told_setup = setup
-        self._kept: GroundState | None = None
+        self._published_setup = setup
+        self._last_state: GroundState | None = None
         self._published: tuple[int | None, Hold | None, int] = None, None, 0
         self._state_at_s = -math.inf
         self._world_at_s = 0.0
-        self._complained: set[str] = set()
+        self._notified: set[str] = set()
 
     @property
     def subscriptions(self) -> Mapping[Topic, ReceiveCallback]:
-        """Subscriptions: topic -> callback with the key and the data, in the node's thread."""
+        """Topic -> callback with key and data, to be called in the node's thread."""
         topics = (STATUS, EXPLORED, STATE, HOLD, WORLD)
-        return self._guard.subscriptions(dict.fromkeys(topics, self._hear))
+        return self._guard.subscriptions(dict.fromkeys(topics, self._receive))
 
     def attach(self, link: Link) -> None:
-        """Set the link to publish on from now on."""
+        """Publish on this link from now on."""
         self._link = self._guard.wrap(link)
 
     def detach(self) -> None:
-        """Publish nothing from now on."""
+        """Stop publishing."""
         self._link = None
 
     @property
     def explored(self) -> tuple[Explored, ...]:
-        """Explored map of each robot, as far as it was heard."""
+        """Explored maps received from the robots."""
         return tuple(_explored(name, cells) for name, cells in self._explored.items())
 
     @property
     def snapshot(self) -> FleetSnapshot:
-        """The fleet now."""
+        """Present snapshot of the fleet."""
         return self.station.snapshot(self.commands.texts)
 
-    def _hear(self, key: str, data: bytes, sender: Sender) -> None:
+    def _receive(self, key: str, data: bytes, sender: Sender) -> None:
         self._set_time()
-        with self.surviving(key):
-            self._receive(key, data, sender)
+        with self.reporting_defects(key):
+            self._dispatch(key, data, sender)
 
     def tick(self) -> None:
-        """Time has passed; some five times a second."""
+        """Do what time makes due. Call at about 5 Hz."""
         self._set_time()
-        self.station.hear_twice(self._guard.duplicate_robots())
+        self.station.set_duplicates(self._guard.duplicate_robots())
         self.station.members_problem = (
             self._guard.members_differ()
             if self.station.is_member
             else "this station's key is not in the list of members: no robot hears it"
         )
-        for robot_id in self._guard.robots_with_future_start():
-            name = self._names.get(f"robot/{robot_id}", "")
-            self._complain(f"ahead {robot_id}", name, _AHEAD)
-        for robot_id in self._guard.pop_unreadable_robots():
-            name = self._names.get(f"robot/{robot_id}", "")
-            self._complain(f"stranger {robot_id}", name, _STRANGER)
-        with self.surviving("tick"):
+        for robots, text in (
+            (self._guard.robots_with_future_start(), _FUTURE_START),
+            (self._guard.pop_unreadable_robots(), _UNREADABLE),
+        ):
+            for robot_id in robots:
+                name = self._names.get(f"robot/{robot_id}", "")
+                self._notify_once(f"{robot_id} {text}", name, text)
+        with self.reporting_defects("tick"):
             self.station.tick()
             self._step()
-        with self.surviving("publish"):
+        with self.reporting_defects("publish"):
             self._publish()
 
     def begin(self, request: Request) -> CommandTask | None:
-        """Begin a command; None if a defect kept it from beginning."""
+        """Begin a command; None if a defect prevented it."""
         self._set_time()
-        with self.surviving("command"):
+        with self.reporting_defects("command"):
             task = self.commands.begin(request)
             self._step()
             return task
         return None
 
     def abandon(self, task: CommandTask, why: str) -> None:
-        """Whoever wanted it does not any more."""
+        """Abandon a command, but not what it has ordered."""
         self._set_time()
         task.abandon(why, withdraw=False)
         self._step()
@@ -154,50 +154,49 @@ class GroundNode:
         self.station.is_member = self._guard.is_member()
         self._guard.receive_time(unix_s)
 
-    def _receive(self, key: str, data: bytes, sender: Sender) -> None:
+    def _dispatch(self, key: str, data: bytes, sender: Sender) -> None:
         source, _, topic = key.rpartition("/")
         name = self._names.get(source)
         if topic == EXPLORED.name:
-            sane = len(data) == EXPLORED_CELLS**2 // 8
-            if name is not None and sane and self._explored.get(name) != data:
+            valid = len(data) == EXPLORED_CELLS**2 // 8
+            if name is not None and valid and self._explored.get(name) != data:
                 self._explored[name] = data
-                self._listener.told(_explored(name, data))
+                self._listener.published(_explored(name, data))
             return
         try:
             if topic == STATE.name:
-                self.station.election.hear_state(decode(GroundState, data), sender)
+                self.station.election.receive_state(decode(GroundState, data), sender)
             elif topic == HOLD.name:
-                self.station.hear_hold(decode(Hold, data), sender)
+                self.station.receive_hold(decode(Hold, data), sender)
             elif topic == WORLD.name:
-                self.station.hear_world(data.decode(errors="replace"))
+                self.station.receive_world(data.decode(errors="replace"))
             else:
                 status = decode(RobotStatus, data)
                 if source != f"robot/{status.robot_id}":
-                    said = self._names.get(f"robot/{status.robot_id}", f"robot {status.robot_id}")
-                    raise MessageError(f"it says that it is {said}")
+                    other = self._names.get(f"robot/{status.robot_id}", f"robot {status.robot_id}")
+                    raise MessageError(f"it has the id of {other}")
                 is_own = sender.release == self._guard.release
-                self.station.hear_status(status, "" if is_own else sender.release.hex())
+                self.station.receive_status(status, "" if is_own else sender.release.hex())
         except MessageError as error:
-            # Another version of the program, say.
-            self._complain(key, name or "", f"{topic} is not understood: {error}")
+            # Perhaps of another release.
+            self._notify_once(key, name or "", f"{topic} is not understood: {error}")
             return
         if name is None and topic == STATUS.name:
-            self._complain(key, "", f"{source.replace('/', ' ')} is heard, and not in fleet.toml")
+            self._notify_once(key, "", f"{source.replace('/', ' ')} is heard but not in fleet.toml")
         self._step()
 
     def _step(self) -> None:
-        """Let commands go on, and tell what is new."""
+        """Continue commands, and publish what is new."""
         self.commands.step()
-        self._listener.stepped()
+        self._listener.progressed()
         setup = self.station.setup
-        if setup != self._told_setup:
-            self._told_setup = setup
-            self._listener.told(setup)
+        if setup != self._published_setup:
+            self._published_setup = setup
+            self._listener.published(setup)
         for event in self.station.new_events():
-            self._listener.told(event)
+            self._listener.published(event)
         if self._published != self._to_publish():
-            # What is new does not wait for its turn.
-            self._publish()
+            self._publish()  # at once, not with the next tick
 
     def _to_publish(self) -> tuple[int | None, Hold | None, int]:
         station = self.station
@@ -206,9 +205,9 @@ class GroundNode:
 
     def _publish(self) -> None:
         station = self.station
-        if station.commands and station.state is not None and station.state != self._kept:
-            self._kept = station.state
-            self._listener.commanded(station.state)
+        if station.commands and station.state is not None and station.state != self._last_state:
+            self._last_state = station.state
+            self._listener.state_changed(station.state)
         now_s, before = self._clock.monotonic_s(), self._published
         self._published = self._to_publish()
         if self._link is None:
@@ -229,21 +228,20 @@ class GroundNode:
             self._link.publish(WORLD, world.encode())
 
     @contextmanager
-    def surviving(self, what: str) -> Iterator[None]:
-        """Tell of a defect, and go on."""
+    def reporting_defects(self, what: str) -> Iterator[None]:
+        """Turn an exception into an event, and go on."""
         try:
             yield
         except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{Path(where.filename).name}, line {where.lineno}"
             text = f"a defect of lpac ground ({what}): {error!r} in {place}"
-            self._complain(f"defect {what}", "", text)
+            self._notify_once(f"defect {what}", "", text)
 
-    def _complain(self, key: str, robot: str, text: str) -> None:
-        """Once for each key is enough."""
-        if key not in self._complained:
-            self._complained.add(key)
-            self.station.tell("presence", robot, text)
+    def _notify_once(self, key: str, robot: str, text: str) -> None:
+        if key not in self._notified:
+            self._notified.add(key)
+            self.station.notify("presence", robot, text)
 
 
 def _explored(name: str, cells: bytes) -> Explored:

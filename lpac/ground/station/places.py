@@ -1,4 +1,4 @@
-"""Places of robots in the flight, as the ground gives them and as the robots have them."""
+"""Robots' places in the flight: assigned by the ground, and reported by the robots."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -13,7 +13,7 @@ _AT_PLACE_M = 0.01
 def with_places(
     setup: FleetSetup, places: Mapping[str, Place], names: Mapping[int, str]
 ) -> FleetSetup:
-    """The setup with robots in other slots; `places` is by robot id, as in a state."""
+    """Apply a state's `places`, by robot id, to the setup."""
     if not places:
         return setup
     seated = {place.slot: (names.get(int(r), ""), place) for r, place in places.items()}
@@ -23,20 +23,20 @@ def with_places(
         if slot.place.slot in seated:
             robot, place = seated[slot.place.slot]
         elif robot and str(setup.robots[robot]) in places:
-            robot = ""  # It was given another place.
+            robot = ""  # It has moved to another slot.
         slots.append(replace(slot, place=place, robot=robot))
     return replace(setup, slots=tuple(slots))
 
 
 def places_of(setup: FleetSetup, statuses: Iterable[RobotStatus]) -> dict[str, Place]:
-    """The places of those that do not have their configured one."""
+    """Places of robots that do not have their configured one, by robot id."""
     configured = {setup.robots[s.robot]: s.place for s in setup.slots if s.robot}
     places = {}
     for status in statuses:
         above_m = status.slot_height_m - setup.base_height_m
         try:
             place = Place(max(0, round(above_m / setup.slot_spacing_m)), status.landing_point_m)
-        except ValueError:  # It says what no place is.
+        except ValueError:  # It reports an invalid place.
             continue
         known = configured.get(status.robot_id)
         there = known is not None and (

@@ -1,14 +1,13 @@
-"""Protocol between the ground process and its clients, and its JSON.
+"""JSON protocol between the ground process and its clients.
 
-The ground process (`lpac ground`) alone speaks to the fleet. Its clients (commands, views, scripts)
-connect to its Unix socket and send one line: a command, or `SUBSCRIBE`. Each line of the answer
-is one JSON object whose only key names its kind, such as {"snapshot": {...}}.
+Only the ground process (`lpac ground`) communicates with the fleet. Clients (commands, views,
+scripts) connect to its Unix socket and send one line: a command, or `SUBSCRIBE`. Each line of the
+answer is a JSON object whose only key names its kind, such as {"snapshot": {...}}.
 
-A command is answered by any number of `CommandProgress`, at least one a second, if only an empty
-one, and then one `CommandReport`. A client that leaves before abandons what is not ordered yet. A
-subscription is answered by a `FleetSetup` (again whenever the world changes), what is known of each
-robot's `Explored`, the last `GroundEvent`s, and then a `FleetSnapshot` at 5 Hz or more, and the
-rest as it happens, until the client leaves.
+A command is answered by `CommandProgress` at least once a second (empty if there is none), then one
+`CommandReport`. A client that disconnects earlier abandons what is not ordered yet. A subscription
+is answered by a `FleetSetup`, the known `Explored` maps and the last `GroundEvent`s; then, until
+the client disconnects, by a `FleetSnapshot` at 5 Hz or more, and the other kinds as they change.
 """
 
 from collections.abc import Callable
@@ -28,18 +27,18 @@ from edge.messages.mission import Origin, Place
 from edge.messages.topics import WORLD
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
 
-# With a reserve: 5 Hz is promised.
+# With a margin for the promised 5 Hz.
 SNAPSHOT_PERIOD_S = 0.18
 SUBSCRIBE = b"subscribe\n"
 
 T = TypeVar("T")
 
-# Commands: `robots` are names, empty for all robots that sit in a slot.
+# In commands, `robots` are names; empty for all robots with a slot.
 
 
 @dataclass(frozen=True, slots=True)
 class SetOrigin:
-    """Set the origin of the mission frame. Refused while one of the robots is armed."""
+    """Set the origin of the mission frame. Refused while any robot is armed."""
 
     origin: Origin
     robots: tuple[str, ...] = ()
@@ -47,7 +46,7 @@ class SetOrigin:
 
 @dataclass(frozen=True, slots=True)
 class SetFence:
-    """Set the fence; None: each robot's configured fence. Refused while one is armed."""
+    """Set the fence; None: each robot's configured fence. Refused while any is armed."""
 
     fence: Fence | None
     robots: tuple[str, ...] = ()
@@ -55,9 +54,9 @@ class SetFence:
 
 @dataclass(frozen=True, slots=True)
 class SetWorld:
-    """World of the virtual sensors: a CoverageControl world file's text, and its name.
+    """Set the virtual sensors' world: a CoverageControl world file's text, and its name.
 
-    Refused while one of the robots is armed.
+    Refused while any robot is armed.
     """
 
     text: str
@@ -69,20 +68,20 @@ class SetWorld:
             raise ValueError(f"name = {self.name!r}: must be printable")
         if len(self.text) > WORLD.limit_bytes:
             raise ValueError(
-                f"{self.name} has {len(self.text)} characters: must be {WORLD.limit_bytes} at most"
+                f"{self.name} has {len(self.text)} characters: must be at most {WORLD.limit_bytes}"
             )
         features = parse_world(self.text, self.name)
         if len(features) > MOST_FEATURES:
             raise ValueError(
-                f"{self.name} has {len(features)} features: must be {MOST_FEATURES} at most"
+                f"{self.name} has {len(features)} features: must be at most {MOST_FEATURES}"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class SetPlaces:
-    """Slots of robots, by their names; all others stay where they are.
+    """Assign slots to robots, by name. Others keep theirs, unless it is one of these slots.
 
-    Who sat in one of these slots sits in none. Refused while one of the robots is armed.
+    Refused while any robot is armed.
     """
 
     places: dict[str, Place]
@@ -90,7 +89,7 @@ class SetPlaces:
 
 @dataclass(frozen=True, slots=True)
 class Enable:
-    """Let robots run their checks, and fly; or with `on` False no more: what flies then holds."""
+    """Let robots run their checks and fly; with `on` False no longer: those in flight hold."""
 
     on: bool = True
     robots: tuple[str, ...] = ()
@@ -98,9 +97,9 @@ class Enable:
 
 @dataclass(frozen=True, slots=True)
 class Takeoff(Bounded):
-    """One after another, `interval_s` apart, the highest first; done when all are at their heights.
+    """Take off one after another, `interval_s` apart, the highest first.
 
-    With `abort_on_failure` nobody else takes off once one has failed.
+    Done when all are at their heights. With `abort_on_failure` a failure cancels the remaining.
     """
 
     robots: tuple[str, ...] = ()
@@ -110,16 +109,16 @@ class Takeoff(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Fly the mission, from hold."""
+    """Start the mission, from hold."""
 
     robots: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class SafetyCommand:
-    """Hold, return to the landing points, or land. `wait`: done only when all have landed.
+    """Hold, return to the landing points, or land in place. `wait`: done when all have landed.
 
-    Anybody may command hold; robots of a return land from the lowest height to the highest.
+    Any station may command hold. In a return, robots land from the lowest to the highest.
     """
 
     action: Literal["hold", "return", "land"]
@@ -129,17 +128,14 @@ class SafetyCommand:
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """Withdraw hold, return or land; who flew this trial's mission before flies it again."""
+    """Withdraw hold, return or land; robots that flew this trial's mission fly it again."""
 
     robots: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class RobotCommand:
-    """Order of one kind to each robot: hand over to a pilot, take back, disarm, kill.
-
-    Unlike elsewhere, no robots are none.
-    """
+    """Hand over to a pilot, take back, disarm or kill robots. Here, empty `robots` means none."""
 
     kind: Literal["pilot", "rejoin", "disarm", "kill"]
     robots: tuple[str, ...]
@@ -147,7 +143,7 @@ class RobotCommand:
 
 @dataclass(frozen=True, slots=True)
 class NextTrial(Bounded):
-    """The next trial, called `trial`, or numbered on: explored maps and messages are forgotten.
+    """Begin the next trial, named `trial` or by the next number; reset maps and messages.
 
     Refused while a robot flies its mission.
     """
@@ -164,7 +160,7 @@ class NextTrial(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class TakeCommand:
-    """Take the command of the fleet from whoever has it."""
+    """Take command of the fleet from the present commander."""
 
 
 Request = (
@@ -174,7 +170,7 @@ Request = (
 
 
 def command_name(request: Request) -> str:
-    """The name of a command in `lpac mission`."""
+    """Name of a command in `lpac mission`."""
     match request:
         case Enable():
             return "enable" if request.on else "disable"
@@ -186,9 +182,9 @@ def command_name(request: Request) -> str:
 
 
 def of_robots(name: str, robots: tuple[str, ...]) -> Request:
-    """The command of that name for these robots, and nothing else of it chosen.
+    """Make the command of that name for these robots, with defaults.
 
-    Raises KeyError if there is none that needs nothing else.
+    Raises KeyError if there is none, or it has no defaults.
     """
     return _OF_ROBOTS[name](robots)
 
@@ -209,21 +205,17 @@ _OF_ROBOTS: dict[str, Callable[[tuple[str, ...]], Request]] = {
 
 
 def in_words(request: Request) -> str:
-    """A command as `lpac mission` has it, with its robots."""
+    """Describe a command as `lpac mission` has it, with its robots."""
     robots: tuple[str, ...] = getattr(request, "robots", ())
     words = [command_name(request), getattr(request, "name", ""), ",".join(robots)]
     return " ".join(filter(None, words))
 
 
-# Answers
-
-
 @dataclass(frozen=True, slots=True)
 class CommandProgress:
-    """Something became known of one robot (its name) while a command runs; "" is the fleet.
+    """Progress of a command for a robot, or for the fleet ("").
 
-    Each robot's result is told so, too, as soon as it is known. Without a text it tells only that
-    the ground process is there.
+    A robot's result is sent this way too, as soon as it is known. An empty text is a keep-alive.
     """
 
     robot: str
@@ -251,7 +243,7 @@ class ResultCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RobotResult:
-    """Result of one robot; `text` is how, or why not. `refusal` is of an order that it refused."""
+    """Result for one robot. `refusal` is the code of an order that it refused."""
 
     robot: str
     code: ResultCode
@@ -260,7 +252,7 @@ class RobotResult:
 
     @property
     def done(self) -> bool:
-        """Whether it did it."""
+        """Whether the robot did it."""
         return self.code is ResultCode.DONE
 
 
@@ -284,7 +276,7 @@ class ProblemCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Why nothing of a command was done, and what helps."""
+    """Why nothing of a command was done, and the remedy."""
 
     code: ProblemCode
     text: str
@@ -292,7 +284,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class CommandReport:
-    """The end of a command: each addressed robot's result, or why nothing was done at all."""
+    """End of a command: each addressed robot's result, or why nothing was done."""
 
     results: tuple[RobotResult, ...] = ()
     problem: Problem | None = None
@@ -324,17 +316,17 @@ _kinds_and_fields = msgspec.json.Decoder(dict[str, msgspec.Raw])
 
 
 def to_line(message: Request | ServerMessage) -> bytes:
-    """The message as one line of JSON."""
+    """Encode a message as one line of JSON."""
     return encode({_NAMES[type(message)]: message}) + b"\n"
 
 
 def request_from_line(line: bytes) -> Request:
-    """Raises MessageError that says what is wrong with it."""
+    """Decode a command. Raises MessageError."""
     return _from_line(_REQUESTS, line)
 
 
 def server_message_from_line(line: bytes) -> ServerMessage:
-    """Raises MessageError that says what is wrong with it."""
+    """Decode an answer. Raises MessageError."""
     return _from_line(_ANSWERS, line)
 
 

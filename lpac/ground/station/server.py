@@ -1,6 +1,6 @@
-"""The ground process: a station, the radio, and the socket of its clients.
+"""The ground process: a station, the radio, and the clients' socket.
 
-All of it runs in one asyncio loop; zenoh's threads only hand over what came.
+Everything runs in one asyncio loop; zenoh's threads only pass messages to it.
 """
 
 import asyncio
@@ -38,33 +38,32 @@ from lpac.ground.station.protocol import (
 )
 from lpac.ground.station.station import is_down
 
-# A client takes it from this that its ground does not hang.
-_WORD_PERIOD_S = 1.0
-# A client that does not read misses pictures, and in the end is left alone.
-_LATE_BYTES = 1 << 20
-_LOST_BYTES = 1 << 25
+# Empty progress tells a client that the ground process does not hang.
+_KEEP_ALIVE_S = 1.0
+# A client that does not read misses snapshots, and is disconnected in the end.
+_SKIP_BYTES = 1 << 20
+_DISCONNECT_BYTES = 1 << 25
 
 
 class _Client:
-    """One that has subscribed."""
 
     def __init__(self, writer: asyncio.StreamWriter) -> None:
         self.writer = writer
 
     def send(self, line: bytes, *, may_be_missed: bool = False) -> None:
         waiting = self.writer.transport.get_write_buffer_size()
-        if waiting > _LOST_BYTES:
+        if waiting > _DISCONNECT_BYTES:
             self.writer.transport.abort()
-        elif not (may_be_missed and waiting > _LATE_BYTES):
+        elif not (may_be_missed and waiting > _SKIP_BYTES):
             self.writer.write(line)
 
 
 class GroundProcess:
-    """`run` it; `tell` hears each event."""
+    """The ground process; `on_event` gets each event."""
 
-    def __init__(self, config: GroundConfig, tell: Callable[[GroundEvent], None]) -> None:
+    def __init__(self, config: GroundConfig, on_event: Callable[[GroundEvent], None]) -> None:
         self._config = config
-        self._tell = tell
+        self._on_event = on_event
         clock, identity = SystemClock(), config.identity
         guard = None if identity is None else identity.guard(clock.monotonic_s)
         self._take_up = (
@@ -78,31 +77,32 @@ class GroundProcess:
         self._clients: set[_Client] = set()
         self._world = config.setup.world
         self._socket_path = socket_path(config.setup.fleet)
-        # What the robots were told last outlives this process.
+        # Restored by the next ground process.
         self._world_path = self._socket_path.with_suffix(".world")
         self._state_path = self._socket_path.with_suffix(".state")
         self._stepped = asyncio.Event()
         self._cannot_write = False
 
     async def run(self, on_listening: Callable[[], None]) -> None:
-        """Until it is cancelled; `on_listening` is called once clients can connect.
+        """Run until cancelled; `on_listening` is called once clients can connect.
 
         Raises GroundError or LinkError, in one line.
         """
         fleet, identity = self._config.setup.fleet, self._config.identity
         loop = asyncio.get_running_loop()
-        self._recall()
+        self._restore()
 
-        def received(hear: ReceiveCallback, key: str, data: bytes) -> None:
+        def received(receive: ReceiveCallback, key: str, data: bytes) -> None:
             with suppress(RuntimeError):  # The loop has ended.
-                loop.call_soon_threadsafe(hear, key, data)
+                loop.call_soon_threadsafe(receive, key, data)
 
         _refuse_second(self._socket_path, fleet)
         with ZenohLink(
             fleet=fleet,
             connect=self._config.connect,
             subscriptions={
-                topic: partial(received, hear) for topic, hear in self._node.subscriptions.items()
+                topic: partial(received, receive)
+                for topic, receive in self._node.subscriptions.items()
             },
             tls=None if identity is None else identity.tls,
             members=self._members,
@@ -111,7 +111,7 @@ class GroundProcess:
             server = await asyncio.start_unix_server(self._serve, self._socket_path, limit=MAX_LINE)
             self._socket_path.chmod(0o600)
             on_listening()
-            ticking = asyncio.create_task(self._tick_on())
+            ticking = asyncio.create_task(self._tick_forever())
             try:
                 await ticking
             finally:
@@ -121,20 +121,20 @@ class GroundProcess:
                     client.writer.transport.abort()
                 self._socket_path.unlink(missing_ok=True)
 
-    def needed(self) -> bool:
-        """Whether robots fly that this station commands, or did a few seconds ago."""
+    def is_needed(self) -> bool:
+        """Whether this station commands robots that fly, or did a few seconds ago."""
         station = self._node.station
-        statuses = map(station.lately, self._config.setup.robots)
+        statuses = map(station.recent_status, self._config.setup.robots)
         return station.commands and not all(map(is_down, filter(None, statuses)))
 
-    async def _tick_on(self) -> None:
+    async def _tick_forever(self) -> None:
         next_s = time.monotonic()
         while True:
             if self._take_up is not None:
                 with self._writing():
                     self._take_up()
             self._node.tick()
-            with self._node.surviving("snapshot"):
+            with self._node.reporting_defects("snapshot"):
                 if self._clients:
                     snapshot = to_line(self._node.snapshot)
                     for client in tuple(self._clients):
@@ -143,12 +143,10 @@ class GroundProcess:
             next_s = max(next_s + SNAPSHOT_PERIOD_S, now_s)
             await asyncio.sleep(next_s - now_s)
 
-    # What the node tells
-
-    def told(self, message: ServerMessage) -> None:
-        """To all clients, and the last world to the disk."""
+    def published(self, message: ServerMessage) -> None:
+        """Send the message to all clients, and save the last world."""
         if isinstance(message, GroundEvent):
-            self._tell(message)
+            self._on_event(message)
         if isinstance(message, FleetSetup) and message.world not in ("", self._world):
             self._world = message.world
             with self._writing(), suppress(ValueError):
@@ -158,13 +156,13 @@ class GroundProcess:
             for client in tuple(self._clients):
                 client.send(line)
 
-    def stepped(self) -> None:
+    def progressed(self) -> None:
         """Wake the clients that wait for a command."""
         self._stepped.set()
         self._stepped.clear()
 
-    def commanded(self, state: GroundState) -> None:
-        """To the disk."""
+    def state_changed(self, state: GroundState) -> None:
+        """Save the state."""
         new = self._state_path.with_suffix(".state-new")
         with self._writing():
             new.write_bytes(encode(state))
@@ -172,23 +170,21 @@ class GroundProcess:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Warn once if state that the next start needs cannot be written."""
+        """Warn once if what the next start restores cannot be written."""
         try:
             yield
         except OSError as error:
             if not self._cannot_write:
                 self._cannot_write = True
                 why = f"{error.filename or self._state_path.parent}: {in_words(error)}"
-                log.warning("what the next start has to know is not written", why=why)
+                log.warning("state for the next start cannot be written", why=why)
 
-    def _recall(self) -> None:
+    def _restore(self) -> None:
         station = self._node.station
         with suppress(OSError, UnicodeDecodeError):
-            station.worlds.remember(self._world_path.read_text("utf-8-sig"))
+            station.worlds.add(self._world_path.read_text("utf-8-sig"))
         with suppress(OSError, MessageError):
-            station.election.remember(decode(GroundState, self._state_path.read_bytes()))
-
-    # Clients
+            station.election.restore(decode(GroundState, self._state_path.read_bytes()))
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
@@ -199,7 +195,7 @@ class GroundProcess:
                 await self._serve_command(line, reader, writer)
         except (ConnectionError, ValueError):  # It left, or its line is too long.
             pass
-        except asyncio.CancelledError:  # This process ends; asyncio would only complain.
+        except asyncio.CancelledError:  # At the end of the process, asyncio would log it.
             pass
         finally:
             writer.close()
@@ -212,8 +208,8 @@ class GroundProcess:
         known: tuple[ServerMessage, ...] = (
             node.station.setup, *node.explored, *node.station.last_events, node.snapshot,
         )  # fmt: skip
-        for told in known:
-            client.send(to_line(told))
+        for message in known:
+            client.send(to_line(message))
         self._clients.add(client)
         try:
             while await reader.read(1 << 16):
@@ -236,14 +232,14 @@ class GroundProcess:
             writer.write(to_line(CommandReport(problem=DEFECT)))
             return
         left = asyncio.create_task(reader.read(1))
-        said_s = -math.inf
+        sent_s = -math.inf
         try:
             while True:
-                news, now_s = running.news(), time.monotonic()
-                if not news and now_s - said_s >= _WORD_PERIOD_S:
-                    news = [CommandProgress("", "")]
-                for progress in news:
-                    said_s = now_s
+                messages, now_s = running.new_progress(), time.monotonic()
+                if not messages and now_s - sent_s >= _KEEP_ALIVE_S:
+                    messages = [CommandProgress("", "")]
+                for progress in messages:
+                    sent_s = now_s
                     writer.write(to_line(progress))
                 if running.report is not None:
                     writer.write(to_line(running.report))
@@ -260,7 +256,7 @@ class GroundProcess:
 
 
 def _refuse_second(path: Path, fleet: str) -> None:
-    """Raises GroundError if one runs already; what a dead one left is removed."""
+    """Raises GroundError if one runs already; removes the socket of a dead one."""
     with socket.socket(socket.AF_UNIX) as probe:
         try:
             probe.connect(str(path))

@@ -1,10 +1,9 @@
-"""A ground station: its knowledge of its fleet, and its wishes for it.
+"""A ground station: what it knows of its fleet, and what it commands.
 
-Pure: time is passed in, messages are handed in, and what is to be published is asked for. One
-thread at a time.
+Pure: the owner passes in time and messages, and asks what to publish. For one thread at a time.
 
-The state that the fleet is told is changed by the station that commands alone (`election`). Only
-hold is everybody's: others repeat a `Hold`, which robots obey, until the commander's state has it.
+Only the commanding station (see `election`) changes the published state. Any station may command
+hold: it repeats a `Hold`, which robots obey, until the commander's state includes it.
 """
 
 import math
@@ -34,16 +33,16 @@ from lpac.analysis.snapshot import (
 )
 from lpac.ground.station.echoes import Echoes
 from lpac.ground.station.election import Election
-from lpac.ground.station.heard import HeardRobots
-from lpac.ground.station.homecoming import Homecoming
 from lpac.ground.station.orders import Orders
 from lpac.ground.station.places import with_places
-from lpac.ground.station.wishes import holds
+from lpac.ground.station.return_queue import ReturnQueue
+from lpac.ground.station.states import holds
+from lpac.ground.station.statuses import RobotStatuses
 from lpac.ground.station.worlds import Worlds
 
-_LATELY_S = 10.0
+_RECENT_S = 10.0
 _EVENTS_KEPT = 200
-# A hold is repeated at least so long, if robots hold and the commander's state does not have it.
+# Minimum time to repeat a hold that all robots obey but the commander's state does not include.
 _ASKED_AT_LEAST_S = 3.0
 # Age of the last state that a robot heard, its status's included: beyond the first it has missed
 # one, beyond the second it is out of reach.
@@ -51,48 +50,43 @@ _LATE_S, _LOST_S = 1.0, 5.0
 
 
 def is_down(status: RobotStatus) -> bool:
-    """Whether it stands on the ground, disarmed as far as it knows; or lies there, killed."""
+    """Whether it is on the ground and not known to be armed, or has been killed."""
     if status.state is FlightState.FAULT:
         return status.armed is False
     return status.state in ON_GROUND and not status.armed
 
 
 class Station:
-    """One ground station.
-
-    One that may not command asks for holds alone: robots take nothing else of it.
-    """
+    """One ground station. Without `may_command` it can only ask for holds."""
 
     def __init__(
         self, setup: FleetSetup, now_s: float, unix_now_s: float, *, may_command: bool = True
     ) -> None:
-        # Whether the list of members has this station's key, and what is wrong with the list.
+        # Whether this station's key is in the list of members, and what is wrong with the list.
         self.is_member = True
         self.members_problem = ""
         self._setup = setup
-        self._robots = HeardRobots(setup.robots, now_s, unix_now_s, self.tell)
+        self._robots = RobotStatuses(setup.robots, now_s, unix_now_s, self.notify)
         self.orders = Orders(setup.operator, self._robots)
         self.worlds = Worlds(setup, self._robots)
         self.election = Election(
-            setup, self._robots, self.orders, self.tell, may_command=may_command
+            setup, self._robots, self.orders, self.notify, may_command=may_command
         )
         self._echoes = Echoes(self._robots)
-        self._homecoming = Homecoming(self._robots)
+        self._return_queue = ReturnQueue(self._robots)
         self._time_base = zlib.crc32(self.orders.prefix.encode()) or 1
         # The hold that this station asks for while another commands.
         self._asked: Hold | None = None
         self._asked_at_s = -math.inf
         self._missions = MissionTracker()
-        # Of the mission that began last: its trial, and when, Unix time; None: before it was heard.
+        # The last mission's trial and Unix start time; None: it began before the robot was heard.
         self._mission: tuple[str, float | None] = "", None
         self._events: deque[GroundEvent] = deque(maxlen=_EVENTS_KEPT)
         self._new_events: list[GroundEvent] = []
 
-    # What it knows
-
     @property
     def state(self) -> GroundState | None:
-        """State that the commander publishes; None: nothing yet."""
+        """The commander's state; None if there is none yet."""
         return self.election.state
 
     @property
@@ -102,12 +96,12 @@ class Station:
 
     @property
     def now_s(self) -> float:
-        """The time of what happened last."""
+        """Present time on the monotonic clock, s."""
         return self._robots.now_s
 
     @property
     def age_s(self) -> float:
-        """How long it has been there, s."""
+        """Time since this station started, s."""
         return self._robots.age_s
 
     @property
@@ -117,34 +111,34 @@ class Station:
 
     @property
     def setup(self) -> FleetSetup:
-        """As it is now: the world, and who sits where, change."""
+        """The fleet's setup with the present world and places."""
         setup, state = self._setup, self.state
-        world = self.worlds.fleets(None if state is None else state.world_id)
+        world = self.worlds.fleet_id(None if state is None else state.world_id)
         if world != setup.world_id:
-            # A wrong text would be shown as if it were the robots'.
+            # No text rather than that of another world.
             setup = replace(setup, world=self.worlds.text(world), world_id=world)
         return with_places(setup, {} if state is None else state.places, self._robots.names)
 
     @property
     def flying(self) -> tuple[str, ...]:
-        """The robots that sit in a slot, in the order of the slots."""
+        """Robots with a slot, in the order of the slots."""
         return tuple(slot.robot for slot in self.setup.slots if slot.robot)
 
     def status(self, name: str) -> RobotStatus | None:
-        """The robot's newest, if it was heard within `FRESH_S`."""
+        """The robot's newest status, if it is not older than `FRESH_S`."""
         return self._robots.status(self._setup.robots[name])
 
-    def lately(self, name: str) -> RobotStatus | None:
-        """The robot's newest, if it was heard within 10 s: a bad link is silent for seconds."""
+    def recent_status(self, name: str) -> RobotStatus | None:
+        """The robot's newest status, if it is not older than 10 s, so that bad links count."""
         last = self._robots.last(self._setup.robots[name])
-        return last[0] if last is not None and last[1] <= _LATELY_S else None
+        return last[0] if last is not None and last[1] <= _RECENT_S else None
 
     def is_duplicate(self, name: str) -> bool:
-        """Whether two programs say that they are this robot."""
+        """Whether two programs have this robot's id."""
         return self._robots.is_duplicate(self._setup.robots[name])
 
     def snapshot(self, running: tuple[str, ...] = ()) -> FleetSnapshot:
-        """All of it, for the clients; `running` are the commands that run."""
+        """Snapshot for the clients; `running` are the commands that run."""
         return FleetSnapshot(
             unix_time_s=self._robots.unix_now_s,
             commander=self.election.commander,
@@ -163,10 +157,8 @@ class Station:
         flown = self._missions.robots and state is not None and state.trial == trial
         return self._robots.unix_now_s - began_s if flown and began_s is not None else None
 
-    # Events
-
-    def tell(self, kind: EventKind, robot: str, text: str, operator: str = "") -> None:
-        """Keep an event for the clients."""
+    def notify(self, kind: EventKind, robot: str, text: str, operator: str = "") -> None:
+        """Add an event for the clients."""
         trial = "" if self.state is None else self.state.trial
         unix_now_s = self._robots.unix_now_s
         event = GroundEvent(unix_now_s, kind, robot, text, operator, trial)
@@ -175,40 +167,38 @@ class Station:
 
     @property
     def last_events(self) -> tuple[GroundEvent, ...]:
-        """The last of them, in order."""
+        """The last 200 events, in order."""
         return tuple(self._events)
 
     def new_events(self) -> list[GroundEvent]:
-        """Those since the last call."""
+        """Events since the last call."""
         events, self._new_events = self._new_events, []
         return events
 
-    # What it hears
-
     def set_time(self, now_s: float, unix_now_s: float) -> None:
-        """It is now so late; everything else follows."""
+        """Set the time. Call before anything else."""
         self._robots.now_s, self._robots.unix_now_s = now_s, unix_now_s
 
-    def hear_twice(self, robots: frozenset[int]) -> None:
-        """These robots' keys speak twice now, by robot id."""
-        self._robots.said_twice = robots
+    def set_duplicates(self, robots: frozenset[int]) -> None:
+        """Set the ids of robots whose key signs for two programs."""
+        self._robots.duplicate_keys = robots
 
-    def hear_status(self, status: RobotStatus, other_release: str = "") -> None:
-        """A robot's status came. One that is not of this fleet is nobody's."""
+    def receive_status(self, status: RobotStatus, other_release: str = "") -> None:
+        """Take a robot's status; robots of other fleets are ignored."""
         known = status.robot_id in self._robots.statuses()
-        if self._robots.hear(status, other_release):
+        if self._robots.receive(status, other_release):
             if self._missions.begins(status.robot_id, status, self.now_s):
                 self._mission = status.trial, self._robots.unix_now_s if known else None
-            self.worlds.hear_status(status)
-            self.orders.hear(status)
-            self.election.hear_status(status)
+            self.worlds.receive_status(status)
+            self.orders.receive(status)
+            self.election.receive_status(status)
 
-    def hear_world(self, text: str) -> None:
-        """Another station sends a world to the robots."""
-        self.worlds.hear(text, self.setup.world_id)
+    def receive_world(self, text: str) -> None:
+        """Take a world file from another station."""
+        self.worlds.receive(text, self.setup.world_id)
 
-    def hear_hold(self, hold: Hold, sender: Sender) -> None:
-        """Another station asks for a hold: the commander takes it up."""
+    def receive_hold(self, hold: Hold, sender: Sender) -> None:
+        """Take a hold from another station; the commander puts it into its state."""
         before = self.state
         if not self.commands or before is None or sender.name not in ("", hold.by):
             return
@@ -216,26 +206,24 @@ class Station:
             return
         self.safety_action("hold", hold.robots or None, hold.by)
         assert self.state is not None
-        self.election.tell_changes(before, self.state, hold.by)
+        self.election.notify_changes(before, self.state, hold.by)
         self.election.interruption = f"{hold.by} commands hold"
 
     def tick(self) -> None:
-        """Time has passed: see who fell silent, and what is to be done by itself."""
-        self._robots.look()
+        """Do what time makes due. Call a few times a second."""
+        self._robots.update()
         self.orders.expire()
-        self.election.listen()
+        self.election.elect()
         if self.commands:
             self._asked = None
-            way_home = self._homecoming.go_on(self.election.take_command())
-            if way_home is not None:
-                self.change(**way_home._asdict())
+            queued = self._return_queue.update(self.election.take_command())
+            if queued is not None:
+                self.change(**queued._asdict())
         elif self._asked is not None:
             self._end_asking(self._asked)
 
-    # What it wants
-
     def change(self, **changes: object) -> int:
-        """Want something else of the fleet; the state's sequence. Takes the command."""
+        """Change fields of the state, taking command; return its sequence."""
         election = self.election
         before = election.take_command()
         after = replace(before, **changes)  # type: ignore[arg-type]
@@ -246,27 +234,29 @@ class Station:
     def safety_action(
         self, safety_action: SafetyAction, robots: Collection[int] | None = None, by: str = ""
     ) -> int:
-        """Ask the fleet, or these robots alone, to hold, return or land; "none" withdraws it.
+        """Command the fleet, or these robots, to hold, return or land; "none" withdraws it.
 
-        `by` is another station that wants it. Returns the sequence.
+        `by` names another station that asked for it. Returns the state's sequence.
         """
         state = self.election.take_command()
         these = frozenset(self._robots.names if robots is None else robots)
-        self._homecoming.forget(these)
+        self._return_queue.forget(these)
         if robots is None:
             return self.change(
                 safety_action=safety_action, safety_action_by=by, robot_safety_actions={},
                 waiting=(),
             )  # fmt: skip
-        asked = state.robot_safety_actions | dict.fromkeys(map(str, sorted(robots)), safety_action)
+        actions = state.robot_safety_actions | dict.fromkeys(
+            map(str, sorted(robots)), safety_action
+        )
         return self.change(
             safety_action_by=by,
-            robot_safety_actions={r: c for r, c in asked.items() if c != state.safety_action},
+            robot_safety_actions={r: a for r, a in actions.items() if a != state.safety_action},
             waiting=tuple(r for r in state.waiting if r not in these),
         )
 
     def hold(self, robots: Collection[int] | None = None) -> int:
-        """Hold, whoever commands; the least sequence that robots obey then."""
+        """Command hold, whoever commands; return the least sequence that robots must obey."""
         election = self.election
         lost = election.commander_age_s > COMMANDER_SILENT_S
         if election.may_command and (self.commands or not election.commander or lost):
@@ -281,14 +271,14 @@ class Station:
     def _hold_as_commander(self, robots: Collection[int] | None) -> int:
         self.safety_action("hold", robots)
         state, statuses = self.election.take_command(), self._robots.statuses().values()
-        # Robots may obey somebody who took over without being heard here.
+        # Robots may obey a station that took over and is not received here.
         others = (s.obeyed_sequence for s in statuses if s.operator != self.operator)
         beyond = min(max(others, default=0), self.election.greatest_obeyed) + 1
         self.election.state = replace(state, sequence=max(state.sequence, beyond))
         return self.election.state.sequence
 
     def _end_asking(self, asked: Hold) -> None:
-        """The commander takes the hold up, or is gone, or is out of reach of this station."""
+        """Stop asking once the commander or all robots hold; take over from a silent commander."""
         if self.election.may_command and self.election.commander_age_s > COMMANDER_SILENT_S:
             self._hold_as_commander(asked.robots or None)
             self._asked = None
@@ -303,23 +293,21 @@ class Station:
             self._asked = None
 
     def set_world(self, text: str) -> int:
-        """Want that world of the robots; the sequence."""
-        self.worlds.remember(text)
+        """Set the robots' world; return the state's sequence."""
+        self.worlds.add(text)
         return self.change(world_id=world_id(text))
 
     def order(self, kind: OrderKind, name: str, trial: str = "") -> str | None:
-        """Order something once; the order's id. None if the robot was never heard."""
+        """Give an order; return its id, or None if the robot was never heard."""
         return self.orders.give(kind, self._setup.robots[name], trial)
-
-    # What is to be published, a few times a second
 
     @property
     def published_hold(self) -> Hold | None:
-        """The hold to ask for; None: none is."""
+        """Hold to publish, if any."""
         return None if self.commands else self._asked
 
     def published_state(self) -> GroundState | None:
-        """None: nothing is. In large fleets robots are echoed in turns, from call to call."""
+        """State to publish, if any, with the next echoes."""
         if not self.commands or self.state is None:
             return None
         return replace(
@@ -339,5 +327,5 @@ class Station:
         )
 
     def published_world(self) -> str | None:
-        """The world's text, while a robot lacks it that may have use for it."""
+        """World file to publish, while a robot needs it."""
         return self.worlds.to_publish(self.state.world_id if self.commands and self.state else None)

@@ -1,4 +1,4 @@
-"""Subscriber to the ground, for programs that go step by step."""
+"""Blocking subscriber to the ground process."""
 
 import threading
 import time
@@ -7,7 +7,7 @@ from functools import partial
 from typing import Self, TypeVar
 
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
-from lpac.ground.procedure import NothingComesError, Procedure, Until, carry_out
+from lpac.ground.procedure import NoSnapshotError, Procedure, Until, carry_out
 from lpac.ground.station.client import command, no_answer, subscribe
 
 _PATIENCE_S = 5.0
@@ -16,9 +16,9 @@ T = TypeVar("T")
 
 
 class GroundSubscriber:
-    """Keeps the newest of what the ground tells, in a thread of its own; a context.
+    """Context that keeps the newest setup and snapshot, in a thread of its own.
 
-    What waits raises GroundError once the ground has ended. Any thread may call anything.
+    Methods that wait raise GroundError once the ground process has ended. Thread-safe.
     """
 
     def __init__(self, fleet: str) -> None:
@@ -28,10 +28,10 @@ class GroundSubscriber:
         self._snapshot: FleetSnapshot | None = None
         self._error: Exception | None = None
         self._leaving = False
-        self._thread = threading.Thread(target=self._run, name="lookout", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="subscriber", daemon=True)
 
     def __enter__(self) -> Self:
-        """Comes back with the first picture. Raises GroundError if there is no ground."""
+        """Wait for the first snapshot. Raises GroundError if there is no ground process."""
         self._thread.start()
         if not self.wait_for(lambda _: True, _PATIENCE_S):
             self._leaving = True
@@ -40,23 +40,23 @@ class GroundSubscriber:
 
     def __exit__(self, *_: object) -> None:
         self._leaving = True
-        # It notices with the next picture; if there comes none, it is left behind.
+        # The thread ends with the next snapshot; without one, it is abandoned.
         self._thread.join(1.0)
 
     @property
     def setup(self) -> FleetSetup:
-        """The fleet's setup, which seldom changes."""
+        """The newest setup."""
         assert self._setup is not None
         return self._setup
 
     @property
     def snapshot(self) -> FleetSnapshot:
-        """The fleet as it was told last."""
+        """The newest snapshot."""
         assert self._snapshot is not None
         return self._snapshot
 
     def wait_for(self, condition: Callable[[FleetSnapshot], bool], timeout_s: float) -> bool:
-        """Wait until `condition` holds of a picture; False if that took too long."""
+        """Wait until a snapshot meets `condition`; False after `timeout_s`."""
         deadline_s = time.monotonic() + timeout_s
         with self._changed:
             while True:
@@ -78,9 +78,9 @@ class GroundSubscriber:
         return time.time()
 
     def carry_out(self, procedure: Procedure[T], meanwhile: Callable[[], None] = lambda: None) -> T:
-        """Go through a procedure; what it comes to. Raises what it raises, and GroundError.
+        """Run a procedure and return its result. Raises what it raises, and GroundError.
 
-        `meanwhile` is called once a second or more often; what it raises ends the procedure.
+        `meanwhile` is called at least once a second; an exception from it ends the procedure.
         """
 
         def wait(wanted: Until) -> bool:
@@ -93,13 +93,13 @@ class GroundSubscriber:
         ask = partial(command, self.fleet, meanwhile=meanwhile)
         try:
             return carry_out(procedure, ask, wait)
-        except NothingComesError:
+        except NoSnapshotError:
             raise no_answer(self.fleet) from None
 
     def _run(self) -> None:
         try:
-            with subscribe(self.fleet) as told:
-                for message in told:
+            with subscribe(self.fleet) as messages:
+                for message in messages:
                     if self._leaving:
                         return
                     with self._changed:
@@ -115,14 +115,14 @@ class GroundSubscriber:
 
 
 def addressed(setup: FleetSetup, robots: Collection[str]) -> tuple[str, ...]:
-    """The robots that a command addresses: these, or all that sit in a slot; in the fleet's order.
+    """Robots that a command addresses: `robots`, or all with a slot if empty; in the fleet's order.
 
-    Raises ValueError for a name that is unknown, or if there is nobody.
+    Raises ValueError for an unknown name or if no robot has a slot.
     """
     for name in robots:
         if name not in setup.robots:
             raise ValueError(f"robot {name!r} is unknown; known are {', '.join(setup.robots)}")
     chosen = set(robots) or {site.robot for site in setup.slots if site.robot}
     if not chosen:
-        raise ValueError(f"no robot of fleet {setup.fleet} sits in a slot")
+        raise ValueError(f"no robot of fleet {setup.fleet} has a slot")
     return tuple(name for name in setup.robots if name in chosen)

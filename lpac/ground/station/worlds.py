@@ -1,51 +1,51 @@
-"""Worlds of the virtual sensors: the texts that a ground station knows, and which robots have."""
+"""World files of the virtual sensors: the texts a ground station knows, and the robots' ids."""
 
 from edge.messages.codes import CheckCode
 from edge.messages.mission import ON_GROUND, RobotStatus, world_id
 from lpac.analysis.commonest import commonest
 from lpac.analysis.snapshot import FleetSetup
-from lpac.ground.station.heard import HeardRobots
+from lpac.ground.station.statuses import RobotStatuses
 
 
 class Worlds:
-    """Texts by their ids, and the fleet's id."""
+    """World texts by id, and the id of each robot's world."""
 
-    def __init__(self, setup: FleetSetup, robots: HeardRobots) -> None:
+    def __init__(self, setup: FleetSetup, robots: RobotStatuses) -> None:
         self._configured = setup.world_id
         self._texts = {setup.world_id: setup.world}
-        # Another station sent it last, and nobody was known to fly over it: a state may follow.
-        self._stray = ""
+        # The last text from another station that no robot has yet: a state with its id may follow.
+        self._candidate = ""
         self._robots = robots
         # By robot id: the world of its newest status.
         self._ids: dict[int, str] = {}
 
-    def hear_status(self, status: RobotStatus) -> None:
-        """Note which one a robot has."""
+    def receive_status(self, status: RobotStatus) -> None:
+        """Note the robot's world."""
         self._ids[status.robot_id] = status.world_id
 
-    def fleets(self, told: str | None) -> str:
-        """The fleet's: what it is told, or else what most robots have."""
-        return told or commonest(self._ids.values()) or self._configured
+    def fleet_id(self, commanded: str | None) -> str:
+        """Id of the fleet's world: the commanded one, or else the one that most robots have."""
+        return commanded or commonest(self._ids.values()) or self._configured
 
-    def remember(self, text: str) -> None:
-        """It may be the one that the robots have."""
+    def add(self, text: str) -> None:
+        """Keep a text, by its id."""
         self._texts[world_id(text)] = text
 
-    def hear(self, text: str, fleets: str) -> None:
-        """Another station sends it to the robots; what nobody flies over is soon forgotten."""
-        if world_id(text) in (fleets, *self._ids.values()):
-            self.remember(text)
+    def receive(self, text: str, fleet_id: str) -> None:
+        """Keep a text from another station; one that nobody uses is replaced by the next."""
+        if world_id(text) in (fleet_id, *self._ids.values()):
+            self.add(text)
         else:
-            self._stray = text
+            self._candidate = text
 
     def text(self, world: str) -> str:
-        """The text of a world, "" if it is not known."""
-        if self._stray and world_id(self._stray) == world:
-            self.remember(self._stray)
+        """Text of a world, "" if unknown."""
+        if self._candidate and world_id(self._candidate) == world:
+            self.add(self._candidate)
         return self._texts.get(world, "")
 
     def to_publish(self, wanted: str | None) -> str | None:
-        """The wanted one's text, while a robot on the ground lacks it, and may have use for it."""
+        """Text of the wanted world, while a robot on the ground lacks it and can use it."""
         text = "" if wanted is None else self.text(wanted)
         lacking = any(
             s.world_id != wanted

@@ -1,7 +1,6 @@
 """`lpac watch`: the fleet in a terminal.
 
-A client of the ground process like any other: it shows the pictures that it is told, and its keys
-send the same commands as anybody's. Quitting it changes nothing in the field.
+An ordinary client of the ground process. Quitting it does not affect the fleet.
 """
 
 import asyncio
@@ -22,25 +21,33 @@ from textual.strip import Strip
 from textual.theme import Theme
 
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
-from lpac.ground.alarms import Alarm, Before, Severity, alarms
+from lpac.ground.alarms import Alarm, Severity, SnapshotHistory, alarms
 from lpac.ground.rendering import Row, Span, TextStyle, gravest, in_order
 from lpac.ground.station.client import listen, send
 from lpac.ground.station.protocol import Request, Resume, SafetyCommand, ServerMessage, TakeCommand
 from lpac.ground.terminal.lines import Line, line
-from lpac.ground.terminal.robots import columns, detail, heading, in_short, table_row
-from lpac.ground.terminal.text import HELP, KEYS, alarm_lines, few_alarms, header, lost, outcome
+from lpac.ground.terminal.robots import columns, detail, heading, summary_lines, table_row
+from lpac.ground.terminal.text import (
+    HELP,
+    KEYS,
+    alarm_lines,
+    connection_lost,
+    few_alarms,
+    header,
+    outcome,
+)
 
 _CONNECT_AGAIN_S = 0.5
-# A ground process that says nothing for so long is as good as gone.
+# A ground process that is silent for this long counts as lost.
 _SILENT_S = 2.0
-# A robot whose alarm is over stays on top for so long, so that no row jumps to and fro.
+# A robot stays on top for this long after its alarm, so that rows do not jump.
 _STAYS_UP_S = 5.0
-# From the top; the last two are in view however small the terminal is.
+# From the top; the bottom parts are always visible.
 _PARTS = ("banner", "header", "alarms", "heading", "body", "selected")
 _BOTTOM = ("message", "keys")
-# Of the height.
+# Fraction of the height.
 _ALARMS_SHARE = 6
-# On fewer lines the table needs what other parts take.
+# With fewer lines, other parts give their lines to the table.
 _SMALL_LINES = 16
 _SCREENSHOT_AFTER_S = 3.0
 _STEPS = {
@@ -69,7 +76,7 @@ _BOLD = ("strong", "critical", "warning", "busy", "calm", "good", "banner")
 
 
 class Lines(ScrollView):
-    """Lines of styled text; only those that change are drawn again."""
+    """Lines of styled text. Only changed lines are redrawn."""
 
     app: "Watch"
 
@@ -79,7 +86,7 @@ class Lines(ScrollView):
         self._selected: int | None = None
 
     def show(self, lines: Sequence[Line], selected: int | None = None) -> None:
-        """Show these; one of them may be `selected`, and is brought into view."""
+        """Show these lines; scroll to the `selected` one."""
         before, self._lines = self._lines, list(lines)
         moved = selected != self._selected
         was, self._selected = self._selected, selected
@@ -98,7 +105,7 @@ class Lines(ScrollView):
             self.scroll_to_region(Region(0, selected, 1, 1), animate=False, force=True)
 
     def render_line(self, y: int) -> Strip:
-        """Textual asks for one line of what is in view."""
+        """Render one visible line for Textual."""
         at = y + self.scroll_offset.y
         base = self.rich_style
         if at >= len(self._lines):
@@ -111,7 +118,7 @@ class Lines(ScrollView):
 
 
 class _Question(NamedTuple):
-    """A question, and the request that is sent if the answer is y."""
+    """A question, and the request to send if the answer is y."""
 
     text: str
     word: str
@@ -126,7 +133,7 @@ _QUESTIONS = {
 
 
 class Watch(App[str]):
-    """The view. `screenshot`: quit after the first few pictures, and give it as SVG."""
+    """The view. With `screenshot`, quit after 3 s and return an SVG."""
 
     ENABLE_COMMAND_PALETTE = False
     TITLE = "lpac watch"
@@ -155,8 +162,8 @@ class Watch(App[str]):
         self._ends_by_screenshot = screenshot
         self._setup: FleetSetup | None = None
         self._snapshot: FleetSnapshot | None = None
-        self._before = Before()
-        self._began_s = self._heard_at_s = time.monotonic()
+        self._history = SnapshotHistory()
+        self._began_s = self._received_at_s = time.monotonic()
         self._problem = "connecting"
         self._up_until_s: dict[str, tuple[Severity, float]] = {}
         self._rows: list[Row] = []
@@ -174,7 +181,7 @@ class Watch(App[str]):
     def on_mount(self) -> None:
         self.theme_changed_signal.subscribe(self, lambda _: self._take_theme())
         self._take_theme()
-        self.set_interval(0.5, self._look)
+        self.set_interval(0.5, self._check_silence)
         self._listen()
 
     def on_resize(self, event: Resize) -> None:
@@ -194,36 +201,34 @@ class Watch(App[str]):
         self.styles_of_text["bar"] = RichStyle(bgcolor=variables["bar"])
         self.refresh()
 
-    # What the ground tells
-
     @work
     async def _listen(self) -> None:
-        """For as long as the view is open; a ground process that ends may come back."""
+        """Follow the ground process, and reconnect when it has ended."""
         while True:
             try:
-                async for told in listen(self._fleet):
-                    self._take(told)
+                async for message in listen(self._fleet):
+                    self._take(message)
             except (OSError, ValueError) as error:
                 self._problem = str(error)
                 self._draw()
             await asyncio.sleep(_CONNECT_AGAIN_S)
 
-    def _take(self, told: ServerMessage) -> None:
+    def _take(self, message: ServerMessage) -> None:
         now_s = time.monotonic()
-        if isinstance(told, FleetSetup):
-            self._setup = told
-        elif isinstance(told, FleetSnapshot) and self._setup is not None:
+        if isinstance(message, FleetSetup):
+            self._setup = message
+        elif isinstance(message, FleetSnapshot) and self._setup is not None:
             if self._problem:
-                self._before = Before()
+                self._history = SnapshotHistory()
             self._problem = ""
-            self._snapshot, self._heard_at_s = told, now_s
-            self._look_at(told, self._setup, now_s)
+            self._snapshot, self._received_at_s = message, now_s
+            self._update(message, self._setup, now_s)
             self._draw()
             if self._ends_by_screenshot and now_s - self._began_s > _SCREENSHOT_AFTER_S:
                 self.exit(self.export_screenshot())
 
-    def _look_at(self, snapshot: FleetSnapshot, setup: FleetSetup, now_s: float) -> None:
-        self._alarms = alarms(setup, snapshot, self._before.take(snapshot, now_s))
+    def _update(self, snapshot: FleetSnapshot, setup: FleetSetup, now_s: float) -> None:
+        self._alarms = alarms(setup, snapshot, self._history.add(snapshot, now_s))
         for robot, alarm in gravest(self._alarms).items():
             if alarm.severity != "note":
                 self._up_until_s[robot] = alarm.severity, now_s + _STAYS_UP_S
@@ -232,28 +237,25 @@ class Watch(App[str]):
         if self._selected not in setup.robots and self._rows:
             self._selected = self._rows[0].robot.name
 
-    def _look(self) -> None:
-        """A ground process that says nothing any more would not be noticed otherwise."""
-        silent_s = time.monotonic() - self._heard_at_s
+    def _check_silence(self) -> None:
+        silent_s = time.monotonic() - self._received_at_s
         if not self._problem and silent_s > _SILENT_S:
-            self._problem = "`lpac ground` runs, but says nothing"
+            self._problem = "`lpac ground` runs but sends nothing"
         if self._problem:
             self._draw()
 
-    # What is seen
-
     def _draw(self) -> None:
-        # While it ends its parts are gone, and a picture may still come.
+        # A snapshot may still come while the view closes.
         if not self.is_running:
             return
         now_s = time.monotonic()
         width = self.size.width
         banner = self.query_one("#banner", Lines)
-        lost_s = now_s - self._heard_at_s
-        # While it connects, which is at once if there is a ground process, nothing is wrong.
+        lost_s = now_s - self._received_at_s
+        # No banner during the first attempt to connect.
         banner.display = bool(self._problem) and lost_s > _CONNECT_AGAIN_S
         if banner.display:
-            banner.show(lost(self._setup, self._problem, lost_s, width))
+            banner.show(connection_lost(self._setup, self._problem, lost_s, width))
         self._show("message", [line(width, Span(" "), self._bottom())])
         self._show("keys", [line(width, *KEYS)])
         setup, snapshot = self._setup, self._snapshot
@@ -280,7 +282,7 @@ class Watch(App[str]):
         )
         if self._view == "table":
             if rows:
-                self._show("selected", in_short(rows[at], width))
+                self._show("selected", summary_lines(rows[at], width))
             shown = columns(setup, width)
             self._show("heading", heading(shown))
             self._show("body", [table_row(shown, row) for row in rows], at)
@@ -304,30 +306,28 @@ class Watch(App[str]):
         self.query_one(f"#{name}", Lines).show(lines, selected)
 
     def _bottom(self) -> Span:
-        return self._message if self._question is None else _asked(self._question)
-
-    # Keys
+        return self._message if self._question is None else _prompt(self._question)
 
     def action_help_quit(self) -> None:
-        """Ctrl-C."""
+        """Quit on Ctrl-C."""
         self.exit()
 
     def on_key(self, event: Key) -> None:
-        """Every key, in one place: hold comes before all else."""
+        """Handle every key here, so that hold takes precedence."""
         key = event.character if event.is_printable and event.character else event.key
         capital = key in ("H", "L") and self._view == "robot"
         robots = (self._selected,) if capital else ()
-        whom = self._selected if capital else "the fleet"
+        target = self._selected if capital else "the fleet"
         question, self._question = self._question, None
         if key in ("h", "H"):
-            self._send(f"hold {whom}", SafetyCommand("hold", robots))
+            self._send(f"hold {target}", SafetyCommand("hold", robots))
         elif question is not None:
             self._message = Span("nothing done")
             if key in ("y", "Y"):
                 self._send(question.word, question.request)
         elif key in ("l", "L"):
             text = f"Land {self._selected if capital else 'the WHOLE FLEET'} where it is?"
-            self._question = _Question(text, f"land {whom}", SafetyCommand("land", robots))
+            self._question = _Question(text, f"land {target}", SafetyCommand("land", robots))
         elif key in _QUESTIONS:
             self._question = _QUESTIONS[key]
         elif key == "q":
@@ -340,7 +340,7 @@ class Watch(App[str]):
         self._draw()
 
     def _move(self, key: str) -> None:
-        """Keys that only change what is seen."""
+        """Handle keys that only change the view."""
         body = self.query_one("#body", Lines)
         if key in ("escape", "enter") and self._view != "table":
             self._go("table")
@@ -365,16 +365,16 @@ class Watch(App[str]):
 
     @work
     async def _send(self, word: str, request: Request) -> None:
-        """Any number side by side: a hold does not wait for what was asked before."""
+        """Send concurrently, so that a hold does not wait for an earlier command."""
         self._message = Span(f"{word} ...", "busy")
         self._draw()
         try:
-            said = outcome(word, await send(self._fleet, request))
+            result = outcome(word, await send(self._fleet, request))
         except (OSError, ValueError) as error:
-            said = Span(f"{word} NOT SENT: {error}", "critical")
-        self._message = Span(f"{time.strftime('%H:%M:%S')} {said.text}", said.style)
+            result = Span(f"{word} NOT SENT: {error}", "critical")
+        self._message = Span(f"{time.strftime('%H:%M:%S')} {result.text}", result.style)
         self._draw()
 
 
-def _asked(question: _Question) -> Span:
+def _prompt(question: _Question) -> Span:
     return Span(f"{question.text}  y: yes, any other key: no ", "banner")

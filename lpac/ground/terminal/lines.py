@@ -1,7 +1,4 @@
-"""Lines of styled text for `lpac watch`, in which nothing is wider or narrower than it should be.
-
-Widths are those of a terminal's cells.
-"""
+"""Lines of styled text for `lpac watch`, of exact widths in terminal cells."""
 
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -15,12 +12,12 @@ Line = tuple[Span, ...]
 
 
 def plain(lines: Iterable[Line]) -> str:
-    """The lines without their styles."""
+    """Join lines as plain text."""
     return "\n".join("".join(span.text for span in line).rstrip() for line in lines)
 
 
 def fit(text: str, width: int, *, right: bool = False) -> str:
-    """The text in exactly `width` cells; cut where it is longer, with "…"."""
+    """Pad the text to `width` cells, or cut it with "…"."""
     text = "".join(c if c.isprintable() else " " for c in text)
     excess = cell_len(text) - width
     if excess > 0:
@@ -29,7 +26,7 @@ def fit(text: str, width: int, *, right: bool = False) -> str:
 
 
 def line(width: int, *spans: Span) -> Line:
-    """The spans in exactly `width` cells."""
+    """Make a line of the spans, padded or cut to `width` cells."""
     out: list[Span] = []
     left = width
     for span in spans:
@@ -40,7 +37,7 @@ def line(width: int, *spans: Span) -> Line:
 
 
 def wrapped(width: int, first: Line, text: Span) -> list[Line]:
-    """The text after `first`, on as many lines as it needs; nothing of it is cut."""
+    """Wrap the text after `first`, indented, on as many lines as it needs."""
     indent = sum(cell_len(span.text) for span in first)
     parts = textwrap.wrap(text.text, max(width - indent, 1)) or [""]
     starts = [first, *[(Span(" " * indent),)] * (len(parts) - 1)]
@@ -51,7 +48,7 @@ def wrapped(width: int, first: Line, text: Span) -> list[Line]:
 
 
 def some(names: Sequence[str], width: int) -> str:
-    """As many of the names as fit, and how many more there are."""
+    """As many names as fit, and the number of the others."""
     for count in range(len(names), 0, -1):
         more = len(names) - count
         text = " ".join(names[:count]) + (f" +{more}" if more else "")

@@ -1,6 +1,6 @@
-"""Robots in `lpac watch`: one a line, or all that is known of one.
+"""Robots in `lpac watch`: a table row each, or the details of one.
 
-Every cell is as wide as its column, whatever its value is, so that nothing ever shifts.
+A cell is always as wide as its column, so that columns do not shift.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,7 +20,7 @@ from lpac.ground.rendering import (
     cell,
     facts,
     quantity,
-    state_look,
+    state_style,
     state_word,
     tables,
 )
@@ -30,7 +30,7 @@ _NARROWEST_NAME, _WIDEST_NAME = 4, 12
 
 
 def columns(setup: FleetSetup, width: int) -> tuple[Column, ...]:
-    """Those that there is room for; the reason takes up what is left."""
+    """Columns that fit; the reason gets the remaining width."""
     longest = max((cell_len(name) for name in setup.robots), default=0)
     name_width = min(max(longest, _NARROWEST_NAME), _WIDEST_NAME)
     offered = [c._replace(width=name_width) if c.key == "name" else c for c in COLUMNS]
@@ -48,10 +48,7 @@ def columns(setup: FleetSetup, width: int) -> tuple[Column, ...]:
 
 
 def heading(shown: Sequence[Column]) -> tuple[Line, Line]:
-    """Headings of the columns, with their units.
-
-    A column without a name of its own shares that of the columns before it.
-    """
+    """Names and units of the columns. A column without a name shares that of the one before."""
     names, units, at = "", [], 0
     for column in shown:
         name = column.top if column.left else column.top.rjust(column.width)
@@ -62,7 +59,7 @@ def heading(shown: Sequence[Column]) -> tuple[Line, Line]:
 
 
 def table_row(shown: Sequence[Column], row: Row) -> Line:
-    """One robot's line."""
+    """Row of a robot."""
     spans = []
     for column in shown:
         text, style = cell(row, column.key)
@@ -71,20 +68,20 @@ def table_row(shown: Sequence[Column], row: Row) -> Line:
 
 
 def detail(row: Row, snapshot: FleetSnapshot, alarms: Iterable[Alarm], width: int) -> list[Line]:
-    """All that is known of a robot."""
+    """Details of a robot."""
     lines = [_detail_title(row.robot, width)]
     for name, text, style in facts(row, snapshot, alarms):
         lines += wrapped(width, (Span(f"{name:<10} ", "faint"),), Span(text, style))
-    told = [_table_lines(table) for table in tables(row)]
-    return [*lines, line(width), *_beside(width, *told)] if told else lines
+    blocks = [_table_lines(table) for table in tables(row)]
+    return [*lines, line(width), *_beside(width, *blocks)] if blocks else lines
 
 
-def in_short(row: Row, width: int) -> tuple[Line, Line]:
-    """Of a robot what the table may have no room for: why it is in its state, fence, release."""
+def summary_lines(row: Row, width: int) -> tuple[Line, Line]:
+    """Two lines of what may not fit into a robot's row, such as its reason and fence margin."""
     status = row.robot.status
     name = Span(f" {row.robot.name}  ", "strong")
     if status is None:
-        return line(width, name, Span("was never heard", "faint")), line(width)
+        return line(width, name, Span("never heard", "faint")), line(width)
     return (
         line(width, name, Span(status.reason.text)),
         line(
@@ -106,7 +103,7 @@ def _detail_title(robot: RobotSnapshot, width: int) -> Line:
     left = (
         name,
         Span(f"(id {robot.robot_id})  ", "faint"),
-        Span(state_word(status), state_look(status).style),
+        Span(state_word(status), state_style(status).style),
         Span(f": {status.reason.text}"),
     )
     return (
@@ -125,7 +122,7 @@ def _table_lines(table: StatusTable) -> list[Line]:
 
 
 def _beside(width: int, left: Sequence[Line], right: Sequence[Line]) -> list[Line]:
-    """Two blocks side by side, or where that is too wide, one below the other."""
+    """Two blocks side by side, or one below the other if they do not fit."""
     widest = max(sum(cell_len(span.text) for span in row) for row in left)
     needed = widest + 3 + max(sum(cell_len(span.text) for span in row) for row in right)
     if needed > width:

@@ -1,4 +1,4 @@
-"""Text of `lpac watch` above and below its table; nothing here has a clock or a terminal."""
+"""Text of `lpac watch` above and below its table. Pure."""
 
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
@@ -39,12 +39,12 @@ HELP = (
     "       Robots with ! and * are on top. A robot that is not heard is faint.",
     "",
     "x y h  in the mission frame; height above its own takeoff point",
-    "feat   age of the features that its policy asks from",
-    "neigh  how many it hears, mean rate and worst age of their messages",
+    "feat   age of the policy's features",
+    "neigh  number of neighbours, mean rate and worst age of their messages",
     "lag    lateness of its loops in the last minute, 99th percentile",
-    "link   age of what it said last",
-    "fence  distance from the fence's line, inside it",
-    "reason its gravest alarm; without one, why it is in its state",
+    "link   age of its last status",
+    "fence  distance inside the fence's line",
+    "reason its gravest alarm; without one, the reason of its state",
 )
 
 
@@ -134,7 +134,7 @@ def _fence(setup: FleetSetup, ground: GroundState | None) -> Span:
 
 
 def alarm_lines(alarms: Sequence[Alarm], width: int) -> list[Line]:
-    """The alarms, those of several robots with the same text once."""
+    """All alarms; robots with the same alarm share a line."""
     return [line for one in _each_alarm(alarms, width) for line in one]
 
 
@@ -157,7 +157,7 @@ def _each_alarm(alarms: Sequence[Alarm], width: int) -> list[list[Line]]:
 
 
 def few_alarms(alarms: Sequence[Alarm], width: int, height: int) -> list[Line]:
-    """As many as there is room for, and how many more there are."""
+    """As many alarms as fit, and the number of the others."""
     each = _each_alarm(alarms, width)
     lines = [line for one in each for line in one]
     if not lines:
@@ -168,8 +168,8 @@ def few_alarms(alarms: Sequence[Alarm], width: int, height: int) -> list[Line]:
     return lines
 
 
-def lost(setup: FleetSetup | None, text: str, lost_s: float, width: int) -> list[Line]:
-    """Above what was known last, when there is no ground process; `text` is why."""
+def connection_lost(setup: FleetSetup | None, text: str, lost_s: float, width: int) -> list[Line]:
+    """Banner while there is no ground process; `text` is the cause."""
     then = "hold, then land where they are."
     if setup is not None:
         hold_s = setup.ground_timeout_s
@@ -178,38 +178,35 @@ def lost(setup: FleetSetup | None, text: str, lost_s: float, width: int) -> list
     texts = (
         f"NO GROUND STATION for {duration(lost_s)}",
         f"{text[:1].upper()}{text[1:]}.",
-        f"Robots that hear none: {then}",
-        "This view comes back by itself; it shows what was known last.",
+        f"Robots without a ground: {then}",
+        "The view reconnects automatically; it shows the last known state.",
     )
     return [line(width, Span(f" {fit(text, width - 1)}", "banner")) for text in texts]
 
 
-# What came of a key
-
-
 def outcome(word: str, report: CommandReport) -> Span:
-    """Results of a command, failures first, with why."""
+    """Results of a command, failures first."""
     if report.problem is not None:
         return Span(f"{word} NOT DONE: {report.problem.text}", "critical")
     who: dict[tuple[bool, str], list[str]] = {}
     for result in report.results:
         who.setdefault((result.done, result.text), []).append(result.robot)
     parts = [
-        f"{'' if done else 'NOT '}{_whom(names, report)}: {text}"
+        f"{'' if done else 'NOT '}{_robots(names, report)}: {text}"
         for (done, text), names in sorted(who.items(), key=lambda item: item[0][0])
     ]
-    return Span(f"{word}: {'; '.join(parts) or 'nobody'}", "good" if report.done else "critical")
+    return Span(f"{word}: {'; '.join(parts) or 'no robot'}", "good" if report.done else "critical")
 
 
-def _whom(names: Sequence[str], report: CommandReport) -> str:
-    everybody = len(names) == len(report.results) > 4
-    return f"all {len(names)}" if everybody else some(names, 16)
+def _robots(names: Sequence[str], report: CommandReport) -> str:
+    is_all = len(names) == len(report.results) > 4
+    return f"all {len(names)}" if is_all else some(names, 16)
 
 
-def all_of_it(
+def full_view(
     setup: FleetSetup, snapshot: FleetSnapshot, alarms: Sequence[Alarm], width: int
 ) -> str:
-    """The whole view of a fleet, as plain text."""
+    """The whole view as plain text."""
     shown = columns(setup, width)
     rows = in_order(setup, snapshot, alarms)
     lines = [

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from lpac.analysis.snapshot import FleetSnapshot
-from lpac.ground.procedure import NothingComesError, Procedure, Until
+from lpac.ground.procedure import NoSnapshotError, Procedure, Until
 from lpac.ground.station.protocol import (
     CommandReport,
     Enable,
@@ -90,7 +90,7 @@ def _command(field: FaultyFleet, request: Request) -> Procedure[CommandReport | 
     answered = field.noted(request)
     try:
         report: CommandReport = yield request
-    except NothingComesError:
+    except NoSnapshotError:
         return None
     finally:
         answered()

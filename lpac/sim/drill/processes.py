@@ -19,7 +19,7 @@ from typing import Self, TypeVar
 from edge.robot.config import Rates, load_config
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.truth import TrueTrack
-from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until, carry_out
+from lpac.ground.procedure import Ground, NoSnapshotError, Procedure, Until, carry_out
 from lpac.ground.station.client import GroundError
 from lpac.ground.station.protocol import CommandReport, Request
 from lpac.sim.drill import injections
@@ -278,11 +278,11 @@ class ProcessField(FaultyFleet):
         def look() -> None:
             self._look()
             if time.monotonic() > end_s:
-                raise NothingComesError
+                raise NoSnapshotError
 
         try:
             return self._ground.command(request, look)
-        except (GroundError, NothingComesError):
+        except (GroundError, NoSnapshotError):
             return None
 
     def _look(self) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from edge.core import F64
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.truth import TrueTrack
-from lpac.ground.procedure import NothingComesError, Procedure, Until, carry_out
+from lpac.ground.procedure import NoSnapshotError, Procedure, Until, carry_out
 from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
 from lpac.sim.air import GROUND
 from lpac.sim.drill.faults import FAULTS, Fault
@@ -98,7 +98,7 @@ class SimulatedField(FaultyFleet):
         """Run a procedure; a command that times out is answered by None."""
 
         def answer(wanted: Request | Until) -> Any:
-            with suppress(NothingComesError):
+            with suppress(NoSnapshotError):
                 return self.ground.carry_out(_one(wanted))
 
         return carry_out(procedure, answer, answer)

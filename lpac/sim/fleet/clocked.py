@@ -9,7 +9,7 @@ from edge.messages.mission import RobotStatus
 from edge.policy.bundle import load_bundle
 from lpac.analysis.flight import FlightRecord, ScriptRecord
 from lpac.analysis.logs import logs_of
-from lpac.ground.procedure import NothingComesError
+from lpac.ground.procedure import NoSnapshotError
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.air import Air
 from lpac.sim.failure import Failure
@@ -105,7 +105,7 @@ def _fly(
     notes = _Notes(fleet)
     try:
         problem = ground.carry_out(flight.fly())
-    except NothingComesError as error:
+    except NoSnapshotError as error:
         problem = str(error)
     fleet.close()
     return notes.flight(flight, problem, earlier, folder if logs else None)

@@ -13,7 +13,7 @@ from edge.core.vehicle import PILOTED
 from edge.messages.mission import FlightState
 from lpac.analysis.flight import ScriptCommand
 from lpac.analysis.snapshot import FleetSnapshot
-from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
+from lpac.ground.procedure import Ground, NoSnapshotError, Procedure, Until
 from lpac.ground.script import (
     MissionStep,
     OriginStep,
@@ -108,7 +108,7 @@ class ScriptedFlight(ScriptListener):
         for takeoffs in range(1, _MOST_TAKEOFFS + 1):
             try:
                 yield from self._beside(self._run.fly())
-            except (ScriptError, NothingComesError) as error:
+            except (ScriptError, NoSnapshotError) as error:
                 problem = str(error)
             else:
                 return None
@@ -174,7 +174,7 @@ class ScriptedFlight(ScriptListener):
             robot.name
             for robot in self._ground.snapshot.robots
             if robot.status and robot.status.state is FlightState.PILOT
-            and robot.status.mode not in PILOTED and robot.name not in self._run.given
+            and robot.status.mode not in PILOTED and robot.name not in self._run.piloted
         )  # fmt: skip
         if not left or self._ground.now_s - self._taken_back_s < _TAKE_BACK_AGAIN_S:
             return
@@ -194,7 +194,7 @@ class ScriptedFlight(ScriptListener):
         """Report a line of text."""
         self._say(text)
 
-    def may(self, question: str) -> bool:
+    def confirm(self, question: str) -> bool:
         """Continue without asking: there is one trial."""
         return True
 

@@ -20,7 +20,7 @@ from edge.identity.guard import Guard, Unguarded
 from edge.identity.members import Role
 from edge.messages.mission import GroundState
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent
-from lpac.ground.procedure import NothingComesError, Procedure, Until, carry_out
+from lpac.ground.procedure import NoSnapshotError, Procedure, Until, carry_out
 from lpac.ground.station.config import load_ground
 from lpac.ground.station.node import GroundNode
 from lpac.ground.station.protocol import (
@@ -184,9 +184,9 @@ class SimulatedGround:
         """Load the state that an earlier one left on its disk."""
         self._commanded, self._world = former._commanded, former._world
         if self._world:
-            self.node.station.worlds.remember(self._world)
+            self.node.station.worlds.add(self._world)
         if self._commanded is not None:
-            self.node.station.election.remember(self._commanded)
+            self.node.station.election.restore(self._commanded)
 
     @property
     def setup(self) -> FleetSetup:
@@ -213,26 +213,26 @@ class SimulatedGround:
         return carry_out(procedure, self.command, self._wait)
 
     def command(self, request: Request) -> CommandReport:
-        """Run a command to its report. Raises NothingComesError on timeout."""
+        """Run a command to its report. Raises NoSnapshotError on timeout."""
         task = self.node.begin(request)
         end_s = self.now_s + _PATIENCE_S * len(self.setup.robots)
         while task is not None and task.report is None and self.now_s < end_s and self.runs:
             self._schedule.run_until(self.now_s + SNAPSHOT_PERIOD_S)
         if task is None or task.report is None:
-            raise NothingComesError(f"{type(request).__name__} does not end")
+            raise NoSnapshotError(f"{type(request).__name__} does not end")
         return task.report
 
-    def told(self, message: ServerMessage) -> None:
+    def published(self, message: ServerMessage) -> None:
         """Keep the events, and the last world on disk."""
         if isinstance(message, GroundEvent):
             self.events.append(message)
         if isinstance(message, FleetSetup) and message.world:
             self._world = message.world
 
-    def stepped(self) -> None:
+    def progressed(self) -> None:
         """Do nothing: no thread waits for it."""
 
-    def commanded(self, state: GroundState) -> None:
+    def state_changed(self, state: GroundState) -> None:
         """Keep the election's state on disk."""
         self._commanded = state
 

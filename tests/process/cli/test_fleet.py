@@ -44,7 +44,7 @@ def test_a_fleet_or_robot_that_is_not_there(tmp_path: Path, nobody: Path) -> Non
 
 def test_deploy_needs_an_image_before_it_asks_any_robot(nobody: Path) -> None:
     line = error_line(called("fleet", "deploy", "--fleet", nobody))
-    assert line.endswith("no image: no image is there: run `make image`")
+    assert line.endswith("no image: has no image: run `make image`")
 
 
 @pytest.mark.parametrize("command", ["start", "restart", "rollback"])

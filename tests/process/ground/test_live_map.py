@@ -28,7 +28,7 @@ from lpac.cli.main import app
 from lpac.fleet.authority import AuthorityError, create_authority
 from lpac.fleet.web_certificate import web_certificate
 from lpac.ground.map import connections
-from lpac.ground.map.access import Access, reached_at
+from lpac.ground.map.access import Access, server_addresses
 from lpac.ground.map.server import Outbox, serving
 from lpac.ground.station.client import command, listen
 from lpac.ground.station.protocol import SetOrigin, TakeCommand
@@ -120,9 +120,9 @@ def test_on_the_network_the_address_has_a_token(fleet: FlownFleet) -> None:
         assert len(address.partition("?token=")[2]) >= 16
         name = urlsplit(address).hostname
         # One that a tablet can open, unless this machine is on no network.
-        assert name in reached_at("0.0.0.0") and name is not None and not is_loopback(name)
+        assert name in server_addresses("0.0.0.0") and name is not None and not is_loopback(name)
         asyncio.run(ask(address))
-    assert reached_at("127.0.0.1") == ["127.0.0.1"]
+    assert server_addresses("127.0.0.1") == ["127.0.0.1"]
 
 
 @pytest.mark.parametrize("with_tls", [False, True], ids=["http", "https"])

@@ -86,7 +86,7 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
         try:
             recorder.wait_for("waiting for it")
             processes.append(ground_process(fleet.fleet_toml))
-            recorder.wait_for("hears the ground station")
+            recorder.wait_for("connected to the ground station")
             wait_for_snapshot(fleet.name)
             for request, state in (
                 (SetOrigin(ORIGIN), S.IDLE), (Enable(), S.PREFLIGHT),
@@ -98,7 +98,7 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
             processes[0].kill()
             recorder.wait_for("has ended")
             processes.append(ground_process(fleet.fleet_toml))
-            recorder.wait_for("hears the ground station")
+            recorder.wait_for("connected to the ground station")
             wait_for_snapshot(fleet.name, lambda told: told.commander == "ann" and all_heard(told))
             # They sink for as long as the test has a use for it.
             for robot in fleet.flown:
@@ -180,4 +180,4 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path, below: str, wh
     file.write_text("")
     done = called("record", "--fleet", FlownFleet(tmp_path, 1).fleet_toml, "--out", file / below)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == f"lpac: {file / below}: cannot be made: {why}\n"
+    assert done.stderr == f"lpac: {file / below}: cannot be created: {why}\n"

@@ -118,7 +118,7 @@ def walk(page: str, folder: Path) -> None:
         simulation.wait_for(f"export {setting[1]}={setting[2]}")
         shown = {
             "lpac ground": [f"r{robot}: idle: " for robot in range(ROBOTS)],
-            "lpac record": ["hears the ground station"],
+            "lpac record": ["connected to the ground station"],
             "lpac watch": [f"r{ROBOTS - 1} "],
             "lpac map --operate": ["http://127.0.0.1:"],
         }

@@ -175,7 +175,7 @@ def test_a_ground_process_that_ends_and_comes_back(tmp_path: Path) -> None:
                 await seen.until(lambda: seen.table_states() == ["idle"] * 2)
                 assert not seen.text("banner")
                 process.send_signal(signal.SIGSTOP)
-                await seen.until(lambda: "says nothing" in seen.text("banner"))
+                await seen.until(lambda: "sends nothing" in seen.text("banner"))
                 process.send_signal(signal.SIGCONT)
                 await seen.until(lambda: not seen.text("banner"))
             await seen.until(lambda: "NO GROUND STATION" in seen.text("banner"))

@@ -22,7 +22,7 @@ from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.analysis.voronoi import coverage_cost
-from lpac.ground.alarms import Before, alarms
+from lpac.ground.alarms import SnapshotHistory, alarms
 from lpac.ground.procedure import fresh_snapshot
 from lpac.ground.station.client import subscribe
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S, in_words
@@ -135,10 +135,10 @@ class SeenFlight:
         A robot tells of its start at once, and of the features and neighbours that it starts with
         half a second later.
         """
-        before, found = Before(), set()
+        history, found = SnapshotHistory(), set()
         started_s = -math.inf
         for earlier, snapshot in pairwise(self.snapshots):
-            two_s_ago = before.take(snapshot, snapshot.unix_time_s)
+            two_s_ago = history.add(snapshot, snapshot.unix_time_s)
             if missions(snapshot) != missions(earlier):
                 started_s = snapshot.unix_time_s
             if snapshot.unix_time_s - started_s > STARTING_S:

@@ -235,7 +235,7 @@ def test_operators_mistakes_are_one_line_each(field: Commanded, tmp_path: Path) 
     assert "not both" in refused("mission", "pilot", "r1", "--robots", "r1")
     assert f"{bad}: record 1 (CircularBND): sigma is missing" in refused("mission", "world", bad)
     assert "cannot be read" in refused("mission", "world", tmp_path / "none.env")
-    assert "there is no such site; known are none" in refused("site", "use", "park")
+    assert "no such site; known are none" in refused("site", "use", "park")
     assert "--toward needs --from" in refused("site", "save", "park", "--toward", "r1")
     missing = tmp_path / "none.toml"
     assert f"{missing}: cannot be read" in refused("mission", "hold", "--fleet", missing)
@@ -391,12 +391,12 @@ def test_robots_get_the_slots_of_the_pads_where_they_stand(field: Commanded) -> 
         return field.refused("mission", "assign", "--seconds", "0.5")
 
     why = problem(2, (7.0, 9.0))
-    assert re.search(r"r2 at \([67]\.., [89]\..\) m stands within 3 m of no pad", why)
+    assert re.search(r"r2 at \([67]\.., [89]\..\) m is not within 3 m of any pad", why)
     why = problem(2, (8.3, 2.0))
     assert re.search(r"r2 at \([78]\.., [12]\..\) m is ambiguous: pad 2 is [12]\.. m", why)
     assert "r1 and r2 stand at one pad, 0" in problem(2, (1.5, 2.0))
     field.stand_at_pads()
-    assert "r0 stands at pad 0, which r1 has: assign both at once" in field.refused(
+    assert "r0 stands at pad 0 of r1: assign both at once" in field.refused(
         "mission", "assign", "--seconds", "0.5", "--robots", "r0"
     )
     field.do("mission", "assign", "--seconds", "0.5")
@@ -415,7 +415,7 @@ def test_site_is_saved_and_used_again(field: Commanded) -> None:
     saved_m = [slot["pad_m"] for slot in slots]
     for pad_m, place_m in zip(saved_m, [(6.0, 8.0), (10.0, 8.0), (14.0, 8.0)], strict=True):
         assert math.dist(pad_m, place_m) < NOISE_M
-    assert "park.toml: is there already: add --force" in field.refused("site", "save", "park")
+    assert "park.toml: exists already: add --force" in field.refused("site", "save", "park")
 
     # Another site, from the robots: r0 is its origin, and r1 stands along its y axis.
     save = ("site", "save", "yard", "--from", "r0", "--toward", "r1", "--seconds", "0.5")
@@ -504,7 +504,7 @@ def test_example_script_is_flown(field: Commanded) -> None:
     assert "left the mission" not in done.stderr
     lines = [re.sub(r"^ *[\d.]+ s  ", "", line) for line in done.stderr.splitlines()]
     in_trial = ["reset maps", "preflight, 60 s", "takeoff", "start", "mission, 3 s",
-                "r2 is given to a pilot", "r2 is back in the mission", "return"]  # fmt: skip
+                "r2 is handed to a pilot", "r2 is back in the mission", "return"]  # fmt: skip
     steps = [line.partition(": ")[2] if line.startswith("trial") else line for line in lines]
     assert [step for step in steps if step in in_trial] == [*in_trial, *in_trial]
     assert steps[0] == "origin"
@@ -551,7 +551,7 @@ def test_script_starts_again_who_holds_by_itself_and_gives_way_to_people(field: 
     done = called("mission", "run", script, "--yes")
     assert done.returncode == 1
     assert re.search(r"r0 left the mission: hold: control was silent for \d\.\d s", done.stderr)
-    assert "mission (steps[2]): alice commands hold: the fleet is theirs" in done.stderr
+    assert "mission (steps[2]): alice commands hold: the script ends" in done.stderr
     field.field.until(lambda: field.states() == [_S.HOLD] * 3)
 
 
@@ -567,7 +567,7 @@ def test_script_ends_with_the_step_that_fails_and_holds_the_fleet(field: Command
     field.hears(robot, once_it_lands)
     why = field.refused("mission", "run", write_script(field.folder, 600.0), "--yes")
     assert "trial 1 of 2: mission (steps[2]): r2: pilot is not taken in land" in why
-    assert "the fleet is told to hold, but r2: land: battery critical" in why
+    assert "hold is commanded, but r2: land: battery critical" in why
     assert "next `lpac mission land`" in why
     assert field.states()[:2] == [_S.HOLD, _S.HOLD]
 
@@ -594,7 +594,7 @@ def test_hold_is_the_operators_also_while_the_script_starts_a_robot(field: Comma
     field.once(starts, lambda: field.ground.node.begin(SafetyCommand("hold")))
     done = called("mission", "run", write_script(field.folder, 600.0), "--yes")
     assert done.returncode == 1
-    assert "mission (steps[2]): alice commands hold: the fleet is theirs" in done.stderr
+    assert "mission (steps[2]): alice commands hold: the script ends" in done.stderr
     assert "told to hold" not in done.stderr
 
 
@@ -604,5 +604,5 @@ def test_script_says_what_is_missing(field: Commanded) -> None:
     field.do("mission", "hold", "r1")
     script = write_script(field.folder, 2.0, **{"# at_most_s = 60": "at_most_s = 1"})
     why = field.refused("mission", "run", script, "--yes")
-    assert "trial 1 of 2: preflight (steps[0]): not ready after 1 s: r1 is told to hold" in why
-    assert "nobody is in the air" in why
+    assert "trial 1 of 2: preflight (steps[0]): not ready after 1 s: r1 is commanded to hold" in why
+    assert "no robot is in the air" in why

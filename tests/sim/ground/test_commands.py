@@ -175,7 +175,7 @@ def test_a_reset_robot_has_not_begun_the_trial() -> None:
     field.done(SafetyCommand("hold"))
     report = field.done(Resume())
     texts = {result.text for result in report.results}
-    assert texts == {"holds: it has not begun this trial; `lpac mission start`"}
+    assert texts == {"holds: not in this trial yet; `lpac mission start`"}
     field.run(5.0)
     assert field.states() == {_S.HOLD}
 
@@ -376,7 +376,7 @@ def test_who_is_killed_fails_and_does_not_hold_up_the_others() -> None:
     field.done(RobotCommand("kill", ("r1",)))
     report = field.do(Enable())
     assert not_done(report) == {"r1": ResultCode.WRONG_STATE}
-    why = "fault: killed by the operator; look at it, then `lpac fleet restart`"
+    why = "fault: killed by the operator; inspect it, then `lpac fleet restart`"
     assert report.results[1].text == why
     assert field.done(SafetyCommand("land", wait=True))
     field.done(Resume())

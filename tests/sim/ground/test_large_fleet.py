@@ -45,13 +45,13 @@ class Ground:
     def refused(self) -> int:
         return 0
 
-    def told(self, _: object) -> None:
+    def published(self, _: object) -> None:
         pass
 
-    def stepped(self) -> None:
+    def progressed(self) -> None:
         pass
 
-    def commanded(self, _: object) -> None:
+    def state_changed(self, _: object) -> None:
         pass
 
 

@@ -99,7 +99,7 @@ def test_a_program_that_starts_again_is_heard_at_once(starts: str) -> None:
         field.restart("alice", away_s=0.0)
         field.run(1.0)
         alice = field.stations["alice"]
-        assert all(alice.lately(name) is not None for name in ("r0", "r1"))
+        assert all(alice.recent_status(name) is not None for name in ("r0", "r1"))
         # It says nothing before it has heard how the fleet is.
         field.until(alice.published_state, 1.0)
         field.run(0.5)

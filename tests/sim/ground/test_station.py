@@ -33,8 +33,8 @@ from lpac.ground.station.protocol import (
     TakeCommand,
     Takeoff,
 )
+from lpac.ground.station.states import next_trial
 from lpac.ground.station.station import Station
-from lpac.ground.station.wishes import next_trial
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import SimulatedGround
 from tests.said import not_done, problem
@@ -67,17 +67,17 @@ def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
         # Statuses come twice a second.
         for at_s, said in ((unix_s - 0.5, before), (unix_s, phase)):
             station.set_time(at_s - 700.0, at_s)
-            station.election.hear_state(state, ANYBODY)
+            station.election.receive_state(state, ANYBODY)
             armed = said not in (_S.IDLE, _S.LANDED)
             for robot_id in (0, 1):
                 changes = {"sequence": next(sequence), "state": said, "armed": armed}
-                station.hear_status(status(robot_id, **changes))
+                station.receive_status(status(robot_id, **changes))
         assert station.snapshot().mission_s == mission_s
         before = phase
     # A station that begins to listen meanwhile does not know when it began.
     late = Station(setup(2), 0.0, 1000.0)
-    late.election.hear_state(state, ANYBODY)
-    late.hear_status(status(0))
+    late.election.receive_state(state, ANYBODY)
+    late.receive_status(status(0))
     assert late.snapshot().mission_s is None
 
 
@@ -114,7 +114,12 @@ def test_the_highest_takes_off_first_and_in_intervals() -> None:
                 began_s.setdefault(robot.robot_id, field.now_s)
     assert running.report.done
     assert list(began_s) == [3, 2, 1, 0]
-    assert [p.robot for p in running.news() if p.text == "takes off"] == ["r3", "r2", "r1", "r0"]
+    assert [p.robot for p in running.new_progress() if p.text == "taking off"] == [
+        "r3",
+        "r2",
+        "r1",
+        "r0",
+    ]
     apart_s = [b - a for a, b in itertools.pairwise(began_s.values())]
     assert all(2.7 < passed_s < 3.6 for passed_s in apart_s), apart_s
 
@@ -348,7 +353,7 @@ def test_a_world_that_another_station_sends_is_known() -> None:
     field.done(SetWorld(OTHER_WORLD, "w.env"))
     assert bob.setup.world == OTHER_WORLD
     assert bob.setup.world_id == field.stations["alice"].setup.world_id
-    bob.hear_world("Uniform 3 1 0 0 9 0 9 9\n")
+    bob.receive_world("Uniform 3 1 0 0 9 0 9 9\n")
     field.done(SetWorld(configured, "w.env"))
     assert bob.setup.world == configured
 
@@ -398,7 +403,7 @@ def test_a_world_that_cannot_be_used_is_not_sent_for_ever() -> None:
         ((CheckCode.WORLD_NOT_ARRIVED, OTHER_WORLD), (CheckCode.WORLD_UNUSABLE, None)), 10
     ):
         waits = FailedCheck(code, "x")
-        station.hear_status(on_ground(0, not_taken=(waits,), sequence=sequence))
+        station.receive_status(on_ground(0, not_taken=(waits,), sequence=sequence))
         assert station.published_world() == text
 
 
@@ -470,7 +475,7 @@ def test_orders_are_for_one_start_of_a_program() -> None:
     assert field.robots[1].state is _S.PREFLIGHT
     assert not field.robots[1].vehicle.armed
     assert [e.text for e in field.events if e.kind == "presence" and e.robot == "r1"] == [
-        "heard", "its program has started again",
+        "heard", "its program has restarted",
     ]  # fmt: skip
 
 
@@ -516,7 +521,7 @@ def test_a_silent_robot_is_killed_too() -> None:
 def test_of_two_orders_the_later_expires_later() -> None:
     station = Station(setup(1), 0.0, 1e9)
     heard = on_ground(0, uptime_s=30.0)
-    station.hear_status(heard)
+    station.receive_status(heard)
     now_s = last_s = 0.0
     for pause_s in (0.0, 0.0, 0.1, 1.0, 5.0):
         now_s += pause_s
@@ -553,7 +558,7 @@ def test_two_programs_of_one_robot_settle_nothing() -> None:
     assert not_done(report)["r1"] is ResultCode.DUPLICATE_ID
     # Nor does a lost status make it another start of one program.
     told = [e.text for e in field.events if e.kind == "presence" and e.robot == "r1"]
-    assert told == ["heard", "two programs say that they are this robot"]
+    assert told == ["heard", "two programs have this robot's id"]
     field.robots[1].program.stop()
     field.run(5.0)
     assert not field.stations["alice"].snapshot().robots[1].duplicate
@@ -627,7 +632,7 @@ def test_a_station_started_again_remembers_what_robots_do_not_say() -> None:
     bob = field.stations["bob"].state
     field.leave("bob")
     after = field.restart("alice", 1.5)
-    after.election.remember(before)
+    after.election.restore(before)
     field.run(5.0)
     assert after.commands
     assert after.state is not None
@@ -685,7 +690,7 @@ def test_places_that_are_none_end_nothing(height_m: float) -> None:
     for step in range(40):
         station.set_time(0.05 * step, 1e9)
         told = on_ground(0, slot_height_m=height_m, ground_age_s=9.0, sequence=10 + step)
-        station.hear_status(told)
+        station.receive_status(told)
         station.tick()
     assert station.commands
     assert station.state is not None
@@ -889,12 +894,12 @@ def test_two_stations_of_a_name_are_an_alarm_and_end_nobody() -> None:
     twin = Station(alice.setup, field.now_s, 1e9)
     state = alice.published_state()
     assert state is not None
-    twin.election.hear_state(state, ANYBODY)
+    twin.election.receive_state(state, ANYBODY)
     assert twin.election.shares_name and not twin.commands
     # A state of its own former life that says less is no other's.
-    alice.election.hear_state(replace(state, sequence=state.sequence - 1), ANYBODY)
+    alice.election.receive_state(replace(state, sequence=state.sequence - 1), ANYBODY)
     assert alice.commands and not alice.election.shares_name
-    alice.election.hear_state(replace(state, sequence=state.sequence + 1), ANYBODY)
+    alice.election.receive_state(replace(state, sequence=state.sequence + 1), ANYBODY)
     assert alice.election.shares_name and not alice.commands
     (alarm, *_) = alarms(alice.setup, alice.snapshot())
     assert (alarm.severity, alarm.code) == ("critical", AlarmCode.NAME_SHARED)

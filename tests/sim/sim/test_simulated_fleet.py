@@ -483,7 +483,7 @@ def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
     fleet.robots[0].start()
     ground.carry_out(_pass(5.0))
     told = [e.text for e in ground.events if e.kind == "presence" and e.robot == "r0"]
-    assert told[-1] == "its program has started again"
+    assert told[-1] == "its program has restarted"
     assert fleet.robots[0].status is not None
     assert fleet.robots[0].status.state is FlightState.PILOT
     # A ground of the same computer knows what the one before said.
@@ -572,7 +572,7 @@ class _Listener(ScriptListener):
     def line(self, text: str) -> None:
         pass
 
-    def may(self, question: str) -> bool:
+    def confirm(self, question: str) -> bool:
         return True
 
 

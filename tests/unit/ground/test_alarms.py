@@ -12,7 +12,7 @@ from edge.core.fence import Fence
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode
 from edge.messages.mission import FlightState, GroundState, LoopStatus, Origin
 from lpac.analysis.snapshot import FleetSnapshot
-from lpac.ground.alarms import SEVERITIES, Alarm, AlarmCode, Before, Severity, alarms
+from lpac.ground.alarms import SEVERITIES, Alarm, AlarmCode, Severity, SnapshotHistory, alarms
 from tests.said import checks, reason, reasons
 from tests.unit.ground.snapshots import (
     FENCE,
@@ -110,9 +110,9 @@ OTHER_FENCE = replace(FENCE, ceiling_m=30.0)
             {"origin": Origin(47.0, 8.0, 0.0)},
             "warning",
             _C.OTHER_ORIGIN,
-            "another origin than the fleet's",
+            "its origin is not the fleet's",
         ),
-        ({"fence": OTHER_FENCE}, "warning", _C.OTHER_FENCE, "another fence than the fleet's"),
+        ({"fence": OTHER_FENCE}, "warning", _C.OTHER_FENCE, "its fence is not the fleet's"),
         (
             {"not_taken": (FailedCheck(CheckCode.KEEPS_FENCE, "fence: not in flight"),)},
             "warning",
@@ -165,8 +165,8 @@ OTHER_FENCE = replace(FENCE, ceiling_m=30.0)
         ({"hdop": 2.5}, "warning", _C.GPS, "GPS precision (HDOP) is 2.5"),
         ({"feature_age_s": 1.4}, "warning", _C.FEATURES, "features are 1.4 s old"),
         ({"feature_age_s": 1.4, "state": _S.HOLD}, "note", _C.FEATURES, "features are 1.4 s old"),
-        ({"feature_age_s": None}, "warning", _C.FEATURES, "has no features to ask the policy with"),
-        ({"neighbour_ages_s": {"0": 0.1}}, "warning", _C.NEIGHBOURS, "hears badly: r2"),
+        ({"feature_age_s": None}, "warning", _C.FEATURES, "has no features for its policy"),
+        ({"neighbour_ages_s": {"0": 0.1}}, "warning", _C.NEIGHBOURS, "receives badly from r2"),
         (
             {"loops": {"control": replace(LOOP, lateness_p99_ms=80.0)}},
             "warning",
@@ -188,10 +188,10 @@ def test_what_a_robot_says_of_itself(
             {"duplicate": True},
             "critical",
             _C.DUPLICATE_ID,
-            "two programs say that they are this robot: end one, or revoke its key",
+            "two programs have this robot's id: end one, or revoke its key",
         ),
         ({"clock_offset_s": -3.2}, "warning", _C.CLOCK, "its clock is 3 s behind"),
-        ({"rates_hz": {"0": 0.5, "2": 2.5}}, "warning", _C.NEIGHBOURS, "hears badly: r0"),
+        ({"rates_hz": {"0": 0.5, "2": 2.5}}, "warning", _C.NEIGHBOURS, "receives badly from r0"),
     ],
 )
 def test_what_the_ground_knows_of_a_robot(
@@ -207,7 +207,9 @@ LOST = (25, 0, 12)
 @pytest.mark.parametrize("arrivals", [LATE, LOST])
 def test_messages_that_come_late_are_as_bad_as_lost_ones(arrivals: tuple[int, ...]) -> None:
     known = {"arrivals": {"0": IN_TIME, "2": arrivals}}
-    assert told(fleet(known=known)) == (Alarm("warning", "r1", _C.NEIGHBOURS, "hears badly: r2"),)
+    assert told(fleet(known=known)) == (
+        Alarm("warning", "r1", _C.NEIGHBOURS, "receives badly from r2"),
+    )
     # Three of four: a policy flies with that.
     assert told(fleet(known={"arrivals": {"2": (4, 0, 3)}})) == ()
     assert told(fleet(known={"arrivals": {"2": (2, 0, 0)}})) == (), "too few to tell"
@@ -230,11 +232,11 @@ def beside_each_other(*numbers: int, badly: Callable[[int, int], bool]) -> Fleet
 @pytest.mark.parametrize(
     ("badly", "text"),
     [
-        (lambda sender, receiver: receiver == 2, "hears nobody in range well"),
-        (lambda sender, receiver: sender == 2, "nobody in range hears it well"),
+        (lambda sender, receiver: receiver == 2, "receives no robot in range well"),
+        (lambda sender, receiver: sender == 2, "no robot in range receives it well"),
         (
             lambda sender, receiver: 2 in (sender, receiver),
-            "hears nobody in range well; nobody in range hears it well",
+            "receives no robot in range well; no robot in range receives it well",
         ),
     ],
 )
@@ -248,13 +250,13 @@ def test_what_one_robot_is_to_blame_for_it_alone_is_told(
 def test_where_nobody_hears_anybody_each_robot_is_told_once() -> None:
     seen = beside_each_other(0, 1, 2, 3, badly=lambda *_: True)
     assert [(a.robot, a.text) for a in alarms(setup(4), seen)] == [
-        (f"r{i}", "hears nobody in range well") for i in range(4)
+        (f"r{i}", "receives no robot in range well") for i in range(4)
     ]
 
 
 def test_a_robot_that_falls_silent_says_nothing_else() -> None:
     said = {"battery": 0.1, "alarms": reasons("position lost")}
-    text = "not heard any more, last in the air in mission"
+    text = "no longer heard, last in the air in mission"
     silent = Alarm("critical", "r1", _C.SILENT, text)
     assert told(fleet(said=said, known={"age_s": 2.5})) == (silent,)
     # Who speaks in its name is heard by the envelopes.
@@ -265,7 +267,7 @@ def test_a_robot_that_falls_silent_says_nothing_else() -> None:
 def test_a_silent_robot_on_the_ground_is_less_grave() -> None:
     robots = robot(status(0)), robot(on_ground(1), age_s=60.0), robot(status(2))
     assert told(snapshot(*robots)) == (
-        Alarm("warning", "r1", _C.SILENT, "not heard any more, last in idle"),
+        Alarm("warning", "r1", _C.SILENT, "no longer heard, last in idle"),
     )
 
 
@@ -290,13 +292,13 @@ def test_a_new_state_may_take_a_moment_to_be_obeyed() -> None:
     hold = GroundState(5, "alice", ORIGIN, enabled=True, safety_action="hold", trial="t1")
     now = replace(fleet(), ground=hold)
     assert told(now, fleet()) == ()
-    assert {a.text for a in told(now, now)} == {"does not obey what the ground says"}
+    assert {a.text for a in told(now, now)} == {"does not obey the ground's state"}
     assert {a.severity for a in told(now, now)} == {"critical"}
     late = replace(fleet(known={"age_s": 1.5}), ground=hold)
     assert {a.robot for a in told(late, late)} == {"r0", "r2"}
-    pictures = Before()
-    assert [pictures.take(fleet(), 0.0), pictures.take(now, 1.9)] == [None, None]
-    assert [pictures.take(late, 3.8), pictures.take(now, 4.5)] == [fleet(), now]
+    history = SnapshotHistory()
+    assert [history.add(fleet(), 0.0), history.add(now, 1.9)] == [None, None]
+    assert [history.add(late, 3.8), history.add(now, 4.5)] == [fleet(), now]
 
 
 def test_a_robot_obeys_another_operator() -> None:
@@ -309,7 +311,7 @@ def test_a_robot_obeys_what_nobody_is_known_to_have_said() -> None:
     assert told(seen, fleet()) == ()
     (alarm,) = told(seen, seen)
     assert alarm[:3] == ("critical", "r1", _C.NOT_OBEYED)
-    assert alarm.text == "obeys sequence 281474976710656, and the ground is at 4"
+    assert alarm.text == "obeys sequence 281474976710656, but the ground is at 4"
 
 
 def test_loops_that_miss_ticks_or_fail() -> None:
@@ -336,13 +338,13 @@ GROUND = GroundState(4, "alice", ORIGIN, enabled=True, safety_action="hold")
             (
                 "critical",
                 _C.NOBODY_COMMANDS,
-                "nobody commands the fleet, and 3 fly: hold or land them",
+                "nobody commands the fleet while 3 robots fly: hold or land",
             ),
         ),
         (
             {},
             {"commander": "bob", "commander_age_s": 2.5},
-            ("critical", _C.COMMANDER_SILENT, "bob commands, but is not heard: hold takes over"),
+            ("critical", _C.COMMANDER_SILENT, "the commander bob is not heard: hold takes command"),
         ),
         (
             {},
@@ -350,13 +352,13 @@ GROUND = GroundState(4, "alice", ORIGIN, enabled=True, safety_action="hold")
             (
                 "critical",
                 _C.NAME_SHARED,
-                "another ground station speaks as alice: two may command by turns",
+                "another ground station uses the name alice: both may command",
             ),
         ),
         (
             {"insecure": True},
             {},
-            ("warning", _C.INSECURE, "insecure: whoever is on the network can fly this fleet"),
+            ("warning", _C.INSECURE, "insecure: anyone on the network can fly this fleet"),
         ),
         (
             {"world": ""},
@@ -364,14 +366,14 @@ GROUND = GroundState(4, "alice", ORIGIN, enabled=True, safety_action="hold")
             (
                 "warning",
                 _C.WORLD_NOT_HERE,
-                "the robots' world c64e4b1b is not here: no density, no cost; "
+                "this station lacks the robots' world c64e4b1b: no density, no cost; "
                 "`lpac mission world FILE`",
             ),
         ),
         (
             {},
             {"ground": replace(GROUND, safety_action_by="bob")},
-            ("warning", _C.HELD_BY_OTHERS, "bob asks 3 robots to hold"),
+            ("warning", _C.HELD_BY_OTHERS, "bob commands 3 robots to hold"),
         ),
         ({}, {"ground": replace(GROUND, safety_action_by="alice")}, None),
     ],

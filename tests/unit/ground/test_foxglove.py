@@ -210,7 +210,7 @@ def test_a_log_becomes_what_was_shown_live(tmp_path: Path, shown: dict[str, list
 
 
 def test_without_a_grounds_log_it_says_what_helps(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"holds no log of a ground .*`lpac record`"):
+    with pytest.raises(ValueError, match=r"has no ground's log .*`lpac record`"):
         ground_logs(tmp_path)
     with pytest.raises(ValueError, match="is not a folder"):
         ground_logs(tmp_path / "absent")

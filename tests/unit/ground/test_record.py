@@ -14,7 +14,7 @@ from edge.messages.mission import FlightState, GroundState, Origin, Place
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent, RobotSnapshot
 from lpac.analysis.voronoi import coverage_cost
-from lpac.ground.record import Recording, _line
+from lpac.ground.record import Recording, _summary
 from lpac.ground.station.protocol import (
     ServerMessage,
 )
@@ -151,7 +151,7 @@ def test_what_is_flown_now_is_that_of_those_who_fly() -> None:
     assert kept.of("cost")[0]["trial"] == "t2"
     cost = kept.recording.cost
     assert cost is not None and cost.normalized is not None
-    assert _line(told, cost).partition("  ")[2] == (
+    assert _summary(told, cost).partition("  ")[2] == (
         f"2 of 2 robots heard  trial t1  1 in the air  cost {cost.normalized:.2f} of the initial"
     )
     kept.recording.take(FleetSnapshot(9.0, "ann", STATE, ()), 9.0)

@@ -13,7 +13,7 @@ from lpac.ground.alarms import alarms
 from lpac.ground.foxglove.view import FoxgloveView
 from lpac.ground.map.view import snapshot_view
 from lpac.ground.rendering import Row, cell, not_ready, problem, rows
-from lpac.ground.terminal.text import all_of_it
+from lpac.ground.terminal.text import full_view
 from tests.said import checks, reasons
 from tests.unit.ground.snapshots import on_ground, robot, setup, snapshot, status
 
@@ -28,7 +28,7 @@ WAITS = on_ground(0, state=_S.PREFLIGHT, failed_checks=checks(HELP, "GPS sees 3 
         (status(0), 0.1, "mission", "mission started"),
         (status(0, alarms=reasons("position lost")), 0.1, "mission", "position lost"),
         (status(0, battery=0.12), 0.1, "mission", "battery critical: 12%"),
-        (status(0), FRESH_S + 1.0, "mission", "not heard any more, last in the air in mission"),
+        (status(0), FRESH_S + 1.0, "mission", "no longer heard, last in the air in mission"),
         (on_ground(0, state=_S.PREFLIGHT, ready=True, failed_checks=()), 0.1, "ready",
          "autopilot and position found"),
         (WAITS, 0.1, "preflight", HELP),
@@ -44,7 +44,7 @@ def test_all_views_say_the_same(
     told = alarms(fleet, seen)
     row = rows(fleet, seen, told)[0]
     assert (cell(row, "state").text, problem(row).text) == (state, why)
-    lines = all_of_it(fleet, seen, told, 200).splitlines()
+    lines = full_view(fleet, seen, told, 200).splitlines()
     assert [line for line in lines if line[2:4] == "r0"][-1].endswith(why or "-")
     page = snapshot_view(fleet, seen, told)["robots"][0]
     assert (page["word"], page["problem"]) == (state, why)

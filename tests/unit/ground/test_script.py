@@ -9,7 +9,7 @@ import pytest
 
 from edge.messages.mission import FlightState, Origin, RobotStatus
 from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
-from lpac.ground.procedure import Procedure, Until, gather
+from lpac.ground.procedure import Procedure, Until, collect_statuses
 from lpac.ground.script import (
     MissionStep,
     OriginStep,
@@ -102,7 +102,7 @@ def test_examples_comments_show_the_defaults(script: Path) -> None:
         ('file = "world.env"', 'file = "w.env"', r"w.env: cannot be read: there is no such file"),
         ('[[steps]]\ndo = "takeoff"', "[steps]", "is not TOML"),
         ('at_s = 40.0\nrobot = "r2"', 'at_s = 90.0\nrobot = "r2"',
-         r"perturb: at_s = 80.0: r2 has no pilot: must be given"),
+         r"perturb: at_s = 80.0: r2 has no pilot: must be handed"),
         ('do = "rejoin"', 'do = "pilot"', r"perturb: at_s = 80.0: r2 has a pilot already"),
         ('do = "return"', 'do = "preflight"', r"steps\[3\] \(preflight\): robots are in the air"),
         ('[[steps]]\ndo = "return"', "", r"steps: the last step is 'mission': must be 'return' or"),
@@ -128,7 +128,7 @@ def test_worlds_sites_and_steps_must_be_there(script: Path) -> None:
     (script.parent / "world.env").write_text("CircularBND 100 100 20 5\n")
     for line in ("[[before]]", 'do = "site"', 'name = "park"'):
         change(script, f"# {line}", line)
-    with pytest.raises(ValueError, match=r"park.toml: there is no such site; known are none"):
+    with pytest.raises(ValueError, match=r"park.toml: no such site; known are none"):
         load_script(script, Sites(script))
     script.write_text("trials = 2\n")
     with pytest.raises(ValueError, match=r"steps = \[\]: must be one or more \[\[steps\]\] tables"):
@@ -162,7 +162,7 @@ class Heard:
     def line(self, text: str) -> None:
         self.lines.append(text)
 
-    def may(self, question: str) -> bool:
+    def confirm(self, question: str) -> bool:
         return True
 
 
@@ -196,9 +196,9 @@ def test_who_flies_is_held_whoever_stands(run: tuple[Told, Heard, ScriptRun]) ->
     ground, _, script = run
     holding = script.hold()
     assert next(holding) == SafetyCommand("hold")
-    assert result_of(holding, CommandReport()).startswith("the fleet is told to hold: next")
+    assert result_of(holding, CommandReport()).startswith("hold is commanded: next")
     ground.tell(on_ground(0), on_ground(1), None)
-    assert result_of(script.hold(), None) == "nobody is in the air"
+    assert result_of(script.hold(), None) == "no robot is in the air"
 
 
 def test_who_left_the_mission_is_started_again_if_it_holds_and_there_is_time(
@@ -234,20 +234,20 @@ def test_nothing_of_a_trial_is_left_for_the_next(run: tuple[Told, Heard, ScriptR
     flying = script.fly()
     assert isinstance(next(flying), SetOrigin)
     assert isinstance(flying.send(CommandReport()), SetWorld)
-    script.given.add("r1")
-    script._said.add("r1")
+    script.piloted.add("r1")
+    script._reported.add("r1")
     assert flying.send(CommandReport()) == NextTrial("paper-1")
-    assert (script.given, script._said) == (set(), set())
+    assert (script.piloted, script._reported) == (set(), set())
 
-    script.given.add("r1")
+    script.piloted.add("r1")
     rejoining = script._perturb(Perturbation(1.0, "r1", "rejoin"))
     assert next(rejoining) == RobotCommand("rejoin", ("r1",))
     assert isinstance(rejoining.send(CommandReport()), Until)
     assert rejoining.send(True) == Start(("r1",))
     result_of(rejoining, CommandReport())
-    assert script.given == set() and heard.lines[-1] == "r1 is back in the mission"
+    assert script.piloted == set() and heard.lines[-1] == "r1 is back in the mission"
 
-    landing = script._bring_down(SafetyCommand("land", wait=True))
+    landing = script._land_all(SafetyCommand("land", wait=True))
     next(landing)
     with pytest.raises(ScriptError) as failed:
         landing.send(CommandReport((RobotResult("r1", ResultCode.NOT_HEARD, "not heard"),)))
@@ -266,7 +266,7 @@ def test_what_a_site_needs_is_asked_again_after_the_rest() -> None:
 
 def test_statuses_are_gathered_from_now_on() -> None:
     ground = Told()
-    gathering = gather(ground, ("r0", "r1"), 2.0)
+    gathering = collect_statuses(ground, ("r0", "r1"), 2.0)
     wanted = next(gathering)
     assert isinstance(wanted, Until) and wanted.at_most_s == 2.0 + FRESH_S
 

@@ -28,13 +28,13 @@ from lpac.ground.site import (
     circular_mean_deg,
     distance_m,
     furthest_m,
+    mean_position_m,
+    measure_site,
     origin_at,
-    place_m,
-    place_now_m,
     places_at,
     require_apart,
-    site_as_it_stands,
     standing,
+    to_mission_frame_m,
     turn_deg,
     wide_fence,
 )
@@ -120,7 +120,7 @@ def test_bearing_and_distance_lead_to_the_second_place(
     assert abs(turn_deg(bearing_deg(start, end), azimuth_deg)) < 1e-3
     assert distance_m(start, end) == pytest.approx(by_m, abs=1e-4)
     origin = Origin(*start, azimuth_deg)
-    assert place_m(origin, end) == pytest.approx((0.0, by_m), abs=1e-3)
+    assert to_mission_frame_m(origin, end) == pytest.approx((0.0, by_m), abs=1e-3)
 
 
 # Origins
@@ -142,7 +142,7 @@ def test_origin_is_where_the_robot_stands_and_points() -> None:
     with pytest.raises(ValueError, match="r2 does not know its heading yet"):
         origin_at(second, None)
     close = standing("r2", [status(moved(centre, 20.0, 1.0), None)])
-    with pytest.raises(ValueError, match=r"r2 stands 1.0 m from r1: it must be 2 m or more"):
+    with pytest.raises(ValueError, match=r"r2 stands 1.0 m from r1: must be at least 2 m"):
         origin_at(first, close)
 
 
@@ -157,10 +157,10 @@ def test_robot_that_moves_or_knows_nothing_gives_no_origin() -> None:
     with pytest.raises(ValueError, match="r1: the positions have no mean"):
         standing("r1", [status((0.0, 0.0), 10.0), status((0.0, 180.0), 10.0)])
     carried = [*[status(centre, 10.0)] * 2, status(moved(centre, 0.0, 12.0), 10.0)]
-    with pytest.raises(ValueError, match=r"r1: its position moved by 8.0 m, allowed are 2 m"):
+    with pytest.raises(ValueError, match=r"r1: its position moved by 8.0 m, must be at most 2 m"):
         standing("r1", carried)
     turned = standing("r1", [status(centre, 10.0), status(centre, 60.0)])
-    with pytest.raises(ValueError, match="r1: its heading moved by 25 deg, allowed are 10"):
+    with pytest.raises(ValueError, match="r1: its heading moved by 25 deg, must be at most 10"):
         origin_at(turned, None)
 
 
@@ -177,7 +177,7 @@ def test_robots_are_at_the_pads_nearest_to_them() -> None:
 @pytest.mark.parametrize(
     ("places", "problem"),
     [
-        ({"r1": (2.0, 6.5)}, r"r1 at \(2.0, 6.5\) m stands within 3 m of no pad; the nearest, 0, "
+        ({"r1": (2.0, 6.5)}, r"r1 at \(2.0, 6.5\) m is not within 3 m of any pad; the nearest, 0, "
                              r"is 4.5 m away"),
         ({"r1": (4.2, 2.0)}, r"r1 at \(4.2, 2.0\) m is ambiguous: pad 1 is 1.8 m and pad 0 2.2 m"),
         ({"r1": (2.0, 2.0), "r2": (1.0, 2.0)}, "r1 and r2 stand at one pad, 0"),
@@ -230,14 +230,17 @@ def at(place_m: tuple[float, float], **changes: Any) -> RobotStatus:
 
 def test_a_robots_place_is_the_mean_of_what_it_says_in_this_frame() -> None:
     before = at((90.0, 90.0), origin=None)
-    assert place_now_m("r1", [before, at((1.0, 2.0)), at((3.0, 2.0))], SITE.origin) == (2.0, 2.0)
+    assert mean_position_m("r1", [before, at((1.0, 2.0)), at((3.0, 2.0))], SITE.origin) == (
+        2.0,
+        2.0,
+    )
     for statuses, problem in (
         ([at((1.0, 2.0)), at((9.0, 2.0))], r"r1: its position moved by 4.0 m"),
-        ([at((1.0, 2.0)), before], "r1 has not taken up the mission's origin"),
+        ([at((1.0, 2.0)), before], "r1 does not have the mission's origin yet"),
         ([at((1.0, 2.0)), at((1.0, 2.0), armed=True)], "r1 is armed: land first"),
     ):
         with pytest.raises(ValueError, match=problem):
-            place_now_m("r1", statuses, SITE.origin)
+            mean_position_m("r1", statuses, SITE.origin)
 
 
 def test_nobody_gets_places_that_are_too_close_for_how_the_fleet_measures() -> None:
@@ -259,10 +262,10 @@ def test_a_site_as_it_stands_has_the_fence_that_the_ground_told() -> None:
     ground = GroundState(4, "alice", SITE.origin, fence=replace(FENCE, buffer_m=3.0))
     here = place_at(SITE.origin, 0.0, 0.0)
     stands = {"r0": Standing("r0", here, 0.1, None)}
-    saved = site_as_it_stands(setup(1), ground, stands, None, None, land_at_pads=False)
+    saved = measure_site(setup(1), ground, stands, None, None, land_at_pads=False)
     assert (saved.origin, saved.fence) == (SITE.origin, ground.fence)
     with pytest.raises(ValueError, match=r"2\.0 m inside the fence, must be 3 m to land there"):
-        site_as_it_stands(setup(1), ground, stands, None, None, land_at_pads=True)
+        measure_site(setup(1), ground, stands, None, None, land_at_pads=True)
 
 
 def test_the_furthest_robot_is_one_that_is_heard() -> None:
@@ -286,7 +289,7 @@ def test_site_is_read_as_it_was_saved(tmp_path: Path) -> None:
     assert sites.names() == ["park"]
 
     other = replace(SITE, slots=SITE.slots[:1])
-    with pytest.raises(ValueError, match=r"park.toml: is there already: add --force"):
+    with pytest.raises(ValueError, match=r"park.toml: exists already: add --force"):
         sites.require_new("park")
     sites.save("park", other)
     assert sites.load("park") == other
@@ -338,5 +341,5 @@ def test_sites_names_are_names(tmp_path: Path) -> None:
     for name in ("../park", "", "a b", "-x"):
         with pytest.raises(ValueError, match="must be 1 to 32 letters"):
             sites.save(name, SITE)
-    with pytest.raises(ValueError, match=r"field.toml: there is no such site; known are none"):
+    with pytest.raises(ValueError, match=r"field.toml: no such site; known are none"):
         sites.load("field")

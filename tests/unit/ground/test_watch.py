@@ -22,8 +22,8 @@ from lpac.ground.station.protocol import (
     RobotResult,
 )
 from lpac.ground.terminal.lines import Line, fit, plain, some
-from lpac.ground.terminal.robots import columns, detail, heading, in_short, table_row
-from lpac.ground.terminal.text import KEYS, all_of_it, few_alarms, header, lost, outcome
+from lpac.ground.terminal.robots import columns, detail, heading, summary_lines, table_row
+from lpac.ground.terminal.text import KEYS, connection_lost, few_alarms, full_view, header, outcome
 from tests.said import checks, reason, reasons
 from tests.unit.ground.snapshots import (
     FENCE,
@@ -85,7 +85,7 @@ def test_no_value_moves_a_column(said: Any, age_s: Any, name: str, width: int) -
     for line in (table_row(shown, row), table_row(shown, ordinary)):
         assert [cell_len(span.text) for span in line[::2]] == [cell - 1 for cell in cells]
         assert all(span.text == " " for span in line[1::2])
-    for line in (*detail(row, snapshot(row.robot), (), max(width, 40)), *in_short(row, width)):
+    for line in (*detail(row, snapshot(row.robot), (), max(width, 40)), *summary_lines(row, width)):
         assert width_of(line) in (width, max(width, 40))
 
 
@@ -129,10 +129,10 @@ def test_header_says_who_commands_and_who_asked() -> None:
     assert plain([KEYS]) == (
         " h HOLD   l land   r resume   Enter robot   a alarms   ? help   q quit"
     )
-    assert plain(lost(setup(1), "it has ended", 65.0, 80)).splitlines()[:3] == [
+    assert plain(connection_lost(setup(1), "it has ended", 65.0, 80)).splitlines()[:3] == [
         " NO GROUND STATION for 01:05",
         " It has ended.",
-        " Robots that hear none: hold after 3 s, land where they are after 13 s.",
+        " Robots without a ground: hold after 3 s, land where they are after 13 s.",
     ]
     assert lines[1].startswith("ENABLED  HOLD by carol  now: takeoff  fence 36x36 m, 2-100 m high")
     assert "origin 47.39774 8.54559 30°  bundle 79929121  world c64e4b1b" in lines[2]
@@ -207,7 +207,7 @@ def test_robots_with_alarms_are_on_top_and_stay_there_for_a_while() -> None:
 
 def test_what_is_printed_once() -> None:
     seen = snapshot(robot(status(0)), robot(status(1, alarms=reasons("position lost"))))
-    text = all_of_it(setup(2), seen, alarms(setup(2), seen), 79)
+    text = full_view(setup(2), seen, alarms(setup(2), seen), 79)
     assert text.splitlines()[3] == "! r1             position lost"
     row = "! r1   mission    90  14 offboard  4.0  0.1 position lost"
     assert text.splitlines()[-2].startswith(row)
@@ -223,14 +223,14 @@ def test_80_columns_show_all_that_is_critical() -> None:
         robot(on_ground(3, state=_S.PREFLIGHT, failed_checks=checks("mission origin is not set"))),
     )
     told = alarms(setup(4), seen)
-    text = all_of_it(setup(4), seen, told, 79).splitlines()
+    text = full_view(setup(4), seen, told, 79).splitlines()
     rows = {line[2:4]: line for line in text[-4:]}
     assert "position lost: no horizontal accur…" in rows["r1"]
-    assert "not heard any more, last in the ai…" in rows["r2"]
+    assert "no longer heard, last in the air i…" in rows["r2"]
     assert rows["r3"].endswith(" mission origin is not set")
     assert rows["r0"].endswith(" mission started")
     views = (
-        all_of_it(setup(4), seen, told, 79),
+        full_view(setup(4), seen, told, 79),
         plain(detail(Row(seen.robots[1], told[0], setup(4)), seen, told, 79)),
     )
     for view in views:
@@ -277,10 +277,10 @@ r1              50  2.5   -   radio          100      0      0  0.2  1.1  3.0
 r2              50  2.5   -
 replayed         3"""
     )
-    assert plain(in_short(row, 100)) == (
+    assert plain(summary_lines(row, 100)) == (
         " r1  mission started\n fence margin -1.0 m   bundle 79929121   world c64e4b1b   trial t1"
     )
-    styled = [s for shown in (*lines, *in_short(row, 100)) for s in shown if s.style in MARKS]
+    styled = [s for shown in (*lines, *summary_lines(row, 100)) for s in shown if s.style in MARKS]
     assert [(span.text.strip()[:15], span.style) for span in styled] == [
         ("heard 9.0 s ago", "critical"),
         ("position lost", "critical"),

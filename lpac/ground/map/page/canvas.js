@@ -3,7 +3,7 @@
 import { colour, direction } from "./dom.js";
 
 const EXPLORED_CELLS = 64;
-// Robots send every 0.4 s, and forget what is older than 0.8 s.
+// Robots send every 0.4 s, and drop messages older than 0.8 s.
 const AGES_S = [0.5, 0.8];
 const LONGEST_PATH = 400;
 const PATH_STEP_M = 0.15;
@@ -22,7 +22,7 @@ export const LAYERS = {
   paths: "Paths", velocity: "Wanted velocity", places: "Pads and landing points", names: "Names",
 };
 
-// Perceptually even: straight in OKLab from `low` to `high`, each [lightness, chroma, hue deg].
+// Perceptually uniform: linear in OKLab from `low` to `high`, each [lightness, chroma, hue deg].
 function ramp(low, high) {
   const lab = ([l, c, h]) => [l, c * Math.cos((h * Math.PI) / 180), c * Math.sin((h * Math.PI) / 180)];
   const [a, b] = [lab(low), lab(high)];
@@ -75,8 +75,6 @@ export class MapCanvas {
     this.setTheme(false);
   }
 
-  // What is shown
-
   setTheme(dark) {
     this.ink = Object.fromEntries(COLOURS.map((name) => [name, colour(name)]));
     this.table = dark ? RAMPS.dark : RAMPS.light;
@@ -88,7 +86,7 @@ export class MapCanvas {
   setSetup(setup) {
     this.setup = setup;
     this.levels = bytes(setup.density?.levels ?? "");
-    // Of a world that the ground does not have, nothing is known.
+    // The ground may lack the world.
     this.known = this.levels.some((level) => level > 0);
     this.paintDensity();
     this.paintVeil();
@@ -127,8 +125,6 @@ export class MapCanvas {
     this.veilIsOld = true;
     this.draw();
   }
-
-  // The view
 
   resize() {
     const { clientWidth, clientHeight } = this.canvas;
@@ -234,8 +230,6 @@ export class MapCanvas {
     return best;
   }
 
-  // Painting
-
   draw() {
     if (this.pending) return;
     this.pending = true;
@@ -263,7 +257,7 @@ export class MapCanvas {
     this.density.getContext("2d").putImageData(image, 0, 0);
   }
 
-  // What nobody has explored (or not the selected robot), and the line around what is.
+  // Cells that no robot (or not the selected one) has explored, and the outline of the explored.
   paintVeil() {
     this.veilIsOld = false;
     const n = EXPLORED_CELLS;
@@ -307,7 +301,7 @@ export class MapCanvas {
     const robots = (this.snapshot?.robots ?? []).filter((robot) => robot.position_m);
     this.paintFence(c);
     this.paintWorld(c);
-    // Below the robots, which nothing may cover.
+    // Below the robots, which must stay visible.
     this.paintNorth(c, w);
     this.paintScale(c, h);
     if (this.layers.cells) this.paintCells(c);
@@ -432,7 +426,7 @@ export class MapCanvas {
     }
   }
 
-  // Of each link the half at a robot shows how old what that robot heard last is.
+  // The half of a link at a robot shows the age of the last message that the robot received.
   paintLinks(c) {
     const robots = this.snapshot?.robots ?? [];
     const heard = robots.map((robot) => new Map(robot.hears ?? []));
@@ -581,7 +575,7 @@ export class MapCanvas {
       tip.closePath();
       nose.addPath(tip, turned);
     }
-    // The halo and the outline of both before either is filled, so that they are one shape.
+    // Draw the halo and outline of both before filling, so that they form one shape.
     for (const [stroke, width] of [[this.ink.halo, 5], [this.ink.ink, 2.5]]) {
       c.strokeStyle = stroke;
       c.lineWidth = width;
@@ -622,7 +616,7 @@ export class MapCanvas {
     c.fill();
     c.globalAlpha = 1;
     c.stroke();
-    // North is as far counter-clockwise from the map's up as up is clockwise from north.
+    // The map's up is clockwise from north by the heading.
     const turn = (-heading * Math.PI) / 180;
     c.save();
     c.rotate(turn);
@@ -668,7 +662,7 @@ export class MapCanvas {
     this.label(c, `${step} m`, x + length + 7, y - 2);
   }
 
-  // The colours of the density beside their name.
+  // Legend of the density's colours.
   paintRamp(canvas) {
     const c = canvas.getContext("2d");
     for (let x = 0; x < canvas.width; x++) {

@@ -1,5 +1,5 @@
-// The coverage cost of the trial over the mission time, beside that of Lloyd's algorithm, which
-// knows the world.
+// Coverage cost of the trial over the mission time, and that of Lloyd's algorithm, which knows the
+// world.
 
 import { clock, colour } from "./dom.js";
 

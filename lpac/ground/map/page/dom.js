@@ -1,8 +1,8 @@
-// Small helpers for the page. What the fleet says is only ever put in as text, never as HTML.
+// Small helpers for the page. Content from the fleet is inserted as text only, never as HTML.
 
 export const $ = (selector) => document.querySelector(selector);
 
-// An element with a class, and children: elements or texts.
+// Makes an element with a class and children (elements or texts).
 export function make(tag, className = "", ...children) {
   const element = document.createElement(tag);
   if (className) element.className = className;
@@ -10,7 +10,7 @@ export function make(tag, className = "", ...children) {
   return element;
 }
 
-// Only what changes is touched, so that a text can be selected while the page is live.
+// Changes only what differs, so that text can be selected while the page is live.
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -21,7 +21,7 @@ export function setClass(element, className) {
 
 const kept = new WeakMap();
 
-// Children of `parent` by key: makes, keeps, reorders and removes them.
+// Synchronises the children of `parent` by key: makes, keeps, reorders and removes them.
 export function sync(parent, items, keyOf, create, update) {
   if (!kept.has(parent)) kept.set(parent, new Map());
   const rows = kept.get(parent);
@@ -53,12 +53,12 @@ export function colour(name) {
   return getComputedStyle(probe).color;
 }
 
-// A number with as many decimals, or a dash.
+// Formats a number with that many decimals, or a dash.
 export function number(value, digits = 0, unit = "") {
   return value === null || value === undefined ? "–" : value.toFixed(digits) + unit;
 }
 
-// Degrees, below 360 also rounded.
+// Formats degrees in [0, 360), also after rounding.
 export function direction(degrees) {
   return `${((Math.round(degrees) % 360) + 360) % 360}°`;
 }

@@ -1,4 +1,4 @@
-// Everything about one robot, in the server's words.
+// Details of one robot, as texts from the server.
 
 import { make, setClass, setText, sync } from "./dom.js";
 import { chip, setChip } from "./panel.js";
@@ -31,7 +31,7 @@ export class Drawer {
   }
 
   open(name, operate) {
-    // Never one robot's numbers below another's name.
+    // Clear, so that one robot's values never appear below another's name.
     if (name !== this.robot) this.body.hidden = true;
     this.robot = name;
     this.element.hidden = name === null;
@@ -41,17 +41,17 @@ export class Drawer {
     for (const button of this.acts.children) setText(button, `${button.label} ${name}`);
     setText(
       this.kill,
-      `Kill is not here: \`lpac mission kill --robots ${name}\` stops its motors, and it falls.`,
+      `No kill here: \`lpac mission kill --robots ${name}\` stops its motors, and it falls.`,
     );
   }
 
-  // From the snapshot: at 5 Hz, as the list.
+  // From the snapshot, at 5 Hz.
   showSnapshot(robot) {
     setChip(this.chip, robot);
     setText(this.state, [robot.word, robot.problem].filter(Boolean).join(": "));
   }
 
-  // From the robot's whole status.
+  // From the robot's complete status.
   show({ name, facts, tables }) {
     if (name !== this.robot) return;
     this.body.hidden = false;

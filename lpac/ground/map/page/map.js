@@ -1,4 +1,4 @@
-// The page: what the server tells, and what the operator asks of it.
+// The page: messages from the server, and the operator's commands.
 
 import { $, clock, make, number, setClass, setText } from "./dom.js";
 import { LAYERS, MapCanvas } from "./canvas.js";
@@ -21,16 +21,12 @@ let cost = null;
 let missionTime = null;
 let selected = null;
 
-// Parts
-
 const map = new MapCanvas($("#map"), (name) => pick(name), showPointer);
 const chart = new Chart($("#chart"));
 const drawer = new Drawer($("#drawer"), {
   onClose: () => pick(null),
   onAct: (action, robot) => (action === "land" ? ask(action, [robot]) : act(action, [robot])),
 });
-
-// From the server
 
 const take = {
   hello(message) {
@@ -111,8 +107,6 @@ function connect() {
   });
 }
 
-// To the server
-
 function tell(message) {
   if (socket?.readyState !== WebSocket.OPEN) return false;
   socket.send(JSON.stringify(message));
@@ -130,13 +124,13 @@ function act(action, robots = []) {
   toast(TITLES[action], "not sent", ["the map's own server is gone; `lpac mission " + action + "` in a terminal"], false);
 }
 
-// One key in every view; where it cannot hold, it says what can.
+// The same key in every view. A map that cannot command tells what can.
 function hold() {
   if (operate) act("hold");
   else toast("Hold", "not from this map, which only observes", ["`lpac mission hold` in a terminal, or h in `lpac watch`"], false);
 }
 
-// Asking first. It covers the map, never the bar: hold is in reach.
+// Confirmation. It covers the map but not the bar, so that hold stays within reach.
 
 let asked = null;
 
@@ -148,7 +142,7 @@ function ask(action, robots = []) {
   $("#ask-no").focus();
 }
 
-// With every snapshot: who says yes gets what he reads, also when a robot became ready meanwhile.
+// Updated with every snapshot, so that "yes" confirms what is shown.
 function showAsked() {
   if (!asked) return;
   const { title, lines } = question(asked);
@@ -178,7 +172,7 @@ function question({ action, robots }) {
   if (action === "command") {
     return {
       title: `Take the command from ${snapshot?.commander}?`,
-      lines: ["Their commands that still run end, but for a kill. From then on they only observe, and hold."],
+      lines: ["Their running commands end, except a kill. From then on they can only observe and command hold."],
     };
   }
   const flying = addressed.filter(({ in_air: is }) => is);
@@ -211,7 +205,7 @@ function showReport({ action, done, results, problem: why }) {
   toast(TITLES[action] ?? action, outcome, lines, done);
 }
 
-// The newest of each action, until it is read.
+// The newest result of each action, until it is dismissed.
 function toast(title, outcome, lines, good) {
   const element = make("div", good ? "toast good" : "toast bad", make("b", "", `${title}: ${outcome}`));
   element.dataset.action = title;
@@ -221,8 +215,6 @@ function toast(title, outcome, lines, good) {
   $("#toasts").append(element);
   setTimeout(() => element.remove(), good ? 5000 : 20000);
 }
-
-// Showing
 
 function showHead() {
   const { robots, alarms, commander, own, safety_action: action, safety_action_by: by, trial, running } = snapshot;
@@ -252,7 +244,7 @@ function showHead() {
   showNext(ours, enabled, action);
 }
 
-// The step that usually comes next has the strong colour; every button works at any time.
+// The usual next step is highlighted; every button works at any time.
 function showNext(ours, enabled, action) {
   const fresh = ours.filter((robot) => robot.fresh);
   const every = (wanted) => fresh.length > 0 && fresh.every(({ look }) => look === wanted);
@@ -267,23 +259,23 @@ function showNext(ours, enabled, action) {
 }
 
 function showCost() {
-  // Where nothing is known to be important, no cost means anything.
+  // Without a known world there is no cost.
   const shown = map.known ? curve : null;
   chart.set(shown?.points ?? [], shown?.lloyd ?? null);
   setText($("#share"), number(shown?.points.at(-1)?.[1], 3));
   setText($("#lloyd"), shown ? (shown.lloyd === null ? "…" : number(shown.lloyd, 3)) : "–");
   setText($("#absolute"), map.known && cost !== null ? cost.toExponential(2).replace("+", "") : "–");
-  $("#cost").title = shown && !shown.whole ? "The map was opened during the mission: J₀ is the first that it saw." : "";
+  $("#cost").title = shown && !shown.whole ? "The map was opened during the mission: J₀ is the first value since then." : "";
   $("#cost").classList.toggle("late", Boolean(shown && !shown.whole));
 }
 
 function showLink() {
   const quiet = snapshot && performance.now() - snapshotAt > QUIET_MS;
-  const gone = problem || (quiet ? "the ground process says nothing" : "");
+  const gone = problem || (quiet ? "the ground process sends nothing" : "");
   setClass($("#link"), `pill link ${gone ? "gone" : "live"}`);
   setText($("#link"), gone ? (socket ? "no ground" : "no map server") : "ground live");
   $("#banner").hidden = !gone;
-  const below = snapshot ? "Below is the last that was heard." : "Until then there is nothing to show.";
+  const below = snapshot ? "The map shows the last known state." : "There is nothing to show until then.";
   setText($("#banner"), gone && `${gone}. ${below}`);
   document.body.classList.toggle("gone", Boolean(gone));
 }
@@ -303,7 +295,7 @@ function pick(name) {
   if (snapshot) showFleet(snapshot.robots, selected, pick);
 }
 
-// Theme and layers, remembered by the browser
+// Theme and layers are kept in the browser's local storage.
 
 function isDark() {
   const chosen = document.documentElement.dataset.theme;
@@ -340,8 +332,6 @@ for (const [name, title] of Object.entries(LAYERS)) {
   });
   $("#switches").append(make("label", "", box, title));
 }
-
-// Clicks and keys
 
 for (const button of document.querySelectorAll("[data-do]")) {
   button.addEventListener("click", () => {

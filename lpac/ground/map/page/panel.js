@@ -1,4 +1,4 @@
-// The side: fleet list, alarms, events.
+// Side panel: fleet list, alarms, events.
 
 import { $, make, setClass, setText, sync } from "./dom.js";
 

@@ -1,7 +1,6 @@
-"""Statuses of a fleet's robots, as a ground station hears them.
+"""Robots' statuses, as a ground station receives them.
 
-Pure: it is as late as it was told. Robots are kept by id and boot nonce, that is by the start of a
-program.
+Pure: the owner sets the time. A program is known by its robot's id and its boot nonce.
 """
 
 from collections import deque
@@ -14,17 +13,19 @@ from edge.messages.mission import RadioCounts, RobotStatus
 from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
 from lpac.ground.rendering import state_and_reason
 
-# Two statuses of one program, of which one is lost, are at most so far apart, unless it has ended.
+# Longest gap between two statuses of a running program, with one status lost.
 _STATUS_GAP_S = 1.2
 _RATE_WINDOW_S = 3.0
-# In which a share of messages can be told.
+# Long enough to estimate the share of messages that arrive.
 _ARRIVALS_WINDOW_S = 10.0
 
-# Keeps an event for the clients, as `Station.tell`.
-Tell = Callable[..., None]
+TWO_PROGRAMS = "two programs have this robot's id"
+
+# As `Station.notify`.
+Notify = Callable[..., None]
 
 
-class _HeardStatus(NamedTuple):
+class _Received(NamedTuple):
     at_s: float
     clock_ahead_s: float
     status: RobotStatus
@@ -32,38 +33,37 @@ class _HeardStatus(NamedTuple):
 
 @dataclass(slots=True)
 class _ProgramStart:
-    """One start of a robot's program, and what it said within the last few seconds."""
+    """One start of a robot's program, and its statuses of the last few seconds."""
 
     first_s: float
-    heard: deque[_HeardStatus] = field(default_factory=deque)
-    # What came of the other robots' messages meanwhile.
+    received: deque[_Received] = field(default_factory=deque)
+    # Of the other robots' messages, within the window.
     arrivals: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
-    def newest(self) -> _HeardStatus:
-        return self.heard[-1]
+    def newest(self) -> _Received:
+        return self.received[-1]
 
-    def take(self, heard: _HeardStatus) -> bool:
-        """Whether it is newer than what was heard before."""
-        if self.heard and heard.status.sequence <= self.newest.status.sequence:
+    def add(self, new: _Received) -> bool:
+        """Add a status; False if it is not newer than the last."""
+        if self.received and new.status.sequence <= self.newest.status.sequence:
             return False
-        self.heard.append(heard)
-        changed = [heard]
-        while heard.at_s - self.heard[0].at_s > _ARRIVALS_WINDOW_S:
-            changed.append(self.heard.popleft())
-        if any(h.status.radio_counts is not None for h in changed):
-            counts = [h.status.radio_counts for h in self.heard]
+        self.received.append(new)
+        changed = [new]
+        while new.at_s - self.received[0].at_s > _ARRIVALS_WINDOW_S:
+            changed.append(self.received.popleft())
+        if any(r.status.radio_counts is not None for r in changed):
+            counts = [r.status.radio_counts for r in self.received]
             self.arrivals = _arrivals([each for each in counts if each is not None])
         return True
 
-    def recent(self) -> list[_HeardStatus]:
-        """Its statuses of the last few seconds, the newest last."""
+    def recent(self) -> list[_Received]:
         newest_at_s = self.newest.at_s
-        return [h for h in self.heard if newest_at_s - h.at_s <= _RATE_WINDOW_S]
+        return [r for r in self.received if newest_at_s - r.at_s <= _RATE_WINDOW_S]
 
 
 class _Robot:
-    """One robot. Its program is the one that was there first, for as long as that speaks."""
+    """One robot. Of two programs, the first counts until it falls silent."""
 
     def __init__(self, name: str, robot_id: int) -> None:
         self.name = name
@@ -84,30 +84,29 @@ class _Robot:
             return None
         return program.newest.status
 
-    def take(self, heard: _HeardStatus) -> bool:
-        """Whether it is a newer status of the robot's program."""
-        nonce = heard.status.boot_nonce
-        if not self._programs.setdefault(nonce, _ProgramStart(heard.at_s)).take(heard):
+    def add(self, new: _Received) -> bool:
+        """Add a status; False unless it is a newer one of the program that counts."""
+        nonce = new.status.boot_nonce
+        if not self._programs.setdefault(nonce, _ProgramStart(new.at_s)).add(new):
             return False
         program = self.program
-        if program is None or heard.at_s - program.newest.at_s > _STATUS_GAP_S:
+        if program is None or new.at_s - program.newest.at_s > _STATUS_GAP_S:
             self._nonce = nonce
         self._programs = {
             n: p
             for n, p in self._programs.items()
-            if n == self._nonce or heard.at_s - p.newest.at_s <= FRESH_S
+            if n == self._nonce or new.at_s - p.newest.at_s <= FRESH_S
         }
         return nonce == self._nonce
 
-    def two_speak(self, now_s: float) -> bool:
-        """Whether two programs speak by turns: one that has ended falls silent instead."""
+    def has_two_programs(self, now_s: float) -> bool:
+        """Whether statuses of two programs interleave. After a restart they do not."""
         alive = [p for p in self._programs.values() if now_s - p.newest.at_s <= FRESH_S]
         return len(alive) > 1 and max(p.first_s for p in alive) < min(p.newest.at_s for p in alive)
 
     def others(self, now_s: float) -> list[tuple[RobotStatus, float]]:
-        """The newest status, and its age, s, of each other program that speaks."""
         newest = (p.newest for nonce, p in self._programs.items() if nonce != self._nonce)
-        return [(h.status, now_s - h.at_s) for h in newest if now_s - h.at_s <= FRESH_S]
+        return [(r.status, now_s - r.at_s) for r in newest if now_s - r.at_s <= FRESH_S]
 
     def snapshot(self, now_s: float) -> RobotSnapshot:
         program = self.program
@@ -119,8 +118,8 @@ class _Robot:
             robot_id=self.robot_id,
             status=newest,
             age_s=now_s - program.newest.at_s,
-            # Delay only makes a clock look late.
-            clock_offset_s=max(heard.clock_ahead_s for heard in recent),
+            # The least delayed status has the best estimate: delay makes a clock look slow.
+            clock_offset_s=max(received.clock_ahead_s for received in recent),
             rates_hz=_rates_hz(recent[0].status, newest),
             arrivals=program.arrivals,
             duplicate=self.duplicate,
@@ -128,86 +127,83 @@ class _Robot:
         )
 
 
-class HeardRobots:
-    """All robots of the fleet, by their ids, of which `robots` holds each name's."""
+class RobotStatuses:
+    """Statuses of the fleet's robots, by robot id. `robots` maps names to ids."""
 
     def __init__(
-        self, robots: Mapping[str, int], now_s: float, unix_now_s: float, tell: Tell
+        self, robots: Mapping[str, int], now_s: float, unix_now_s: float, notify: Notify
     ) -> None:
         self.names = {robot_id: name for name, robot_id in robots.items()}
         self.now_s, self.unix_now_s = now_s, unix_now_s
         self._began_s = now_s
         self._robots = {id_: _Robot(name, id_) for id_, name in self.names.items()}
-        # By what their messages' envelopes tell: who is there twice, though one alone is heard.
-        self.said_twice: frozenset[int] = frozenset()
-        self._tell = tell
+        # Ids of robots whose key signs for two programs, even if only one is received.
+        self.duplicate_keys: frozenset[int] = frozenset()
+        self._notify = notify
 
     @property
     def age_s(self) -> float:
-        """How long they have been listened to, s."""
+        """Time since this was made, s."""
         return self.now_s - self._began_s
 
-    def hear(self, status: RobotStatus, other_release: str = "") -> bool:
-        """Whether that is a newer status of a robot's program than was known.
-
-        It is not if the robot is of no name here, or if another program is that robot.
-        """
+    def receive(self, status: RobotStatus, other_release: str = "") -> bool:
+        """Add a status. False if it is not newer, of an unknown robot, or of a second program."""
         robot = self._robots.get(status.robot_id)
         if robot is None:
             return False
         before = None if robot.program is None else robot.program.newest.status
-        if not robot.take(_HeardStatus(self.now_s, status.unix_time_s - self.unix_now_s, status)):
+        if not robot.add(_Received(self.now_s, status.unix_time_s - self.unix_now_s, status)):
             return False
         robot.other_release = other_release
         if before is not None and before.boot_nonce != status.boot_nonce:
-            self._tell("presence", robot.name, "its program has started again")
+            self._notify("presence", robot.name, "its program has restarted")
         if before is None or (before.state, before.reason) != (status.state, status.reason):
-            self._tell("state", robot.name, state_and_reason(status))
-        self._look_at(robot)
+            self._notify("state", robot.name, state_and_reason(status))
+        self._update(robot)
         return True
 
-    def look(self) -> None:
-        """Time has passed: see who fell silent, and who is there twice."""
+    def update(self) -> None:
+        """Notify of robots that fell silent or have two programs. Call periodically."""
         for robot in self._robots.values():
-            self._look_at(robot)
+            self._update(robot)
 
-    def _look_at(self, robot: _Robot) -> None:
+    def _update(self, robot: _Robot) -> None:
         present = robot.fresh(self.now_s) is not None
         if present != robot.present:
             robot.present = present
             text = "heard" if present else f"silent for {FRESH_S:g} s"
-            self._tell("presence", robot.name, text)
-        duplicate = robot.two_speak(self.now_s) or robot.robot_id in self.said_twice
+            self._notify("presence", robot.name, text)
+        duplicate = robot.has_two_programs(self.now_s) or robot.robot_id in self.duplicate_keys
         if duplicate and not robot.duplicate:
-            self._tell("presence", robot.name, "two programs say that they are this robot")
+            self._notify("presence", robot.name, TWO_PROGRAMS)
         robot.duplicate = duplicate
 
     def status(self, robot_id: int) -> RobotStatus | None:
-        """The robot's newest, if it was heard within `FRESH_S`."""
+        """The robot's newest status, if it is not older than `FRESH_S`."""
         return self._robots[robot_id].fresh(self.now_s)
 
     def last(self, robot_id: int) -> tuple[RobotStatus, float] | None:
-        """The robot's newest status, however old, and its age, s; None if it was never heard."""
+        """The robot's newest status and its age, s; None if there was none."""
         program = self._robots[robot_id].program
         return (
             None if program is None else (program.newest.status, self.now_s - program.newest.at_s)
         )
 
     def others(self, robot_id: int) -> list[tuple[RobotStatus, float]]:
-        """The same of each other program that says it is this robot, if it is still heard."""
+        """Fresh statuses, with their ages, s, of further programs with this robot's id."""
         return self._robots[robot_id].others(self.now_s)
 
     def statuses(self) -> dict[int, RobotStatus]:
-        """The newest of each robot that was heard within `FRESH_S`, by robot id."""
+        """Each robot's newest status that is not older than `FRESH_S`, by robot id."""
         fresh = ((id_, robot.fresh(self.now_s)) for id_, robot in self._robots.items())
         return {robot_id: status for robot_id, status in fresh if status is not None}
 
     def is_duplicate(self, robot_id: int) -> bool:
-        """Whether two programs say that they are this robot."""
+        """Whether two programs have this robot's id."""
         return self._robots[robot_id].duplicate
 
     def snapshots(self) -> tuple[RobotSnapshot, ...]:
-        """State of each, in the fleet's order."""
+        """Snapshots of all robots, in the fleet's order."""
         return tuple(robot.snapshot(self.now_s) for robot in self._robots.values())
 
 
@@ -221,11 +217,11 @@ def _rates_hz(first: RobotStatus, last: RobotStatus) -> dict[str, float]:
     }
 
 
-def _arrivals(told: Sequence[RadioCounts]) -> dict[str, tuple[int, ...]]:
-    if not told:
+def _arrivals(counts: Sequence[RadioCounts]) -> dict[str, tuple[int, ...]]:
+    if not counts:
         return {}
-    before = told[0].arrivals
+    before = counts[0].arrivals
     return {
-        robot: Arrivals.of_counts(counts).since(Arrivals.of_counts(before.get(robot, ()))).counts
-        for robot, counts in told[-1].arrivals.items()
+        robot: Arrivals.of_counts(its).since(Arrivals.of_counts(before.get(robot, ()))).counts
+        for robot, its in counts[-1].arrivals.items()
     }

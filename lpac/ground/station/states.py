@@ -1,4 +1,4 @@
-"""States that a ground tells its fleet: which counts, what they ask, and what changes in words."""
+"""Ground states: their rank, their safety actions, and their changes in words."""
 
 import re
 
@@ -6,12 +6,12 @@ from edge.messages.mission import GroundState, Hold
 
 
 def rank(state: GroundState) -> tuple[int, str]:
-    """Of two states, robots obey that of the greater rank."""
+    """Sort key of a state. Robots obey the state of the greater rank."""
     return state.sequence, state.operator
 
 
 def holds(state: GroundState, hold: Hold) -> bool:
-    """Whether the state has that hold."""
+    """Whether the state includes the hold."""
     if not hold.robots:
         actions = {state.safety_action, *state.robot_safety_actions.values()}
         return actions == {"hold"} and not state.waiting
@@ -22,7 +22,7 @@ def holds(state: GroundState, hold: Hold) -> bool:
 
 
 def is_safer(before: GroundState, after: GroundState) -> bool:
-    """Whether more is asked to hold, to return or to land than before."""
+    """Whether the change asks the fleet or a robot for another hold, return or landing."""
     if after.safety_action not in ("none", before.safety_action):
         return True
     return any(
@@ -31,17 +31,17 @@ def is_safer(before: GroundState, after: GroundState) -> bool:
     )
 
 
-def changes_in_words(before: GroundState, after: GroundState) -> list[str]:
-    """Describe what the ground newly wants, for people."""
+def describe_changes(before: GroundState, after: GroundState) -> list[str]:
+    """Describe the changes for people."""
 
     def changed(*names: str) -> bool:
         return any(getattr(before, name) != getattr(after, name) for name in names)
 
     words: list[str] = []
     if changed("safety_action", "robot_safety_actions"):
-        asked = (after.safety_action, *after.robot_safety_actions.values())
+        actions = (after.safety_action, *after.robot_safety_actions.values())
         safer = is_safer(before, after)
-        words.append(next(c for c in asked if c != "none") if safer else "resume")
+        words.append(next(a for a in actions if a != "none") if safer else "resume")
     if changed("enabled", "robot_enabled"):
         words.append("enable" if after.enabled or any(after.robot_enabled.values()) else "disable")
     words += [name for name in ("origin", "fence", "places") if changed(name)]
@@ -53,7 +53,7 @@ def changes_in_words(before: GroundState, after: GroundState) -> list[str]:
 
 
 def next_trial(trial: str) -> str:
-    """The name after this one: "t1", "t2", ..."""
+    """Name of the next trial: "t1", then "t2", ..."""
     match = re.fullmatch(r"(.*?)(\d+)", trial)
     if match is None:
         return f"{trial}2" if trial else "t1"
