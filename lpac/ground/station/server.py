@@ -46,7 +46,6 @@ _DISCONNECT_BYTES = 1 << 25
 
 
 class _Client:
-
     def __init__(self, writer: asyncio.StreamWriter) -> None:
         self.writer = writer
 
