@@ -60,7 +60,7 @@ def edge() -> Callable[[], object]:
         odometry=Standing(),
         parameters=PacParameters(scale=ModelScale(_ENV_SCALE, 0.25), max_speed_m_s=1.25),
     )
-    robot.clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+    robot.clock.update(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     data = encode(AggregatedMessage(np.zeros(policy.message_size, np.float32)), "float16")
     for number, position_m in enumerate(_NEIGHBOURS_M, 1):
         beacon = replace(robot.beacon(0.0), robot_id=number, position_m=position_m)

@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def _listed(value: object) -> object:
-    """Encode arrays, unknown to msgspec, as lists of numbers."""
+    """Encode arrays, which msgspec does not support, as lists of numbers."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     raise NotImplementedError(f"a {type(value).__name__}")
@@ -46,7 +46,7 @@ def changes(before: object, after: object) -> dict[str, Any]:
             name: _chosen(now) if name in choices else _whole(now)
             for name, now in zip(names, values(after), strict=True)
         }
-    told: dict[str, Any] = {}
+    differences: dict[str, Any] = {}
     for name, was, now in zip(names, values(before), values(after), strict=True):
         if now is was:
             # The usual case: replaced dataclasses keep other fields.
@@ -55,16 +55,16 @@ def changes(before: object, after: object) -> dict[str, Any]:
         if kind is float:
             # The next most frequent case. Zeros are included, since their signs may differ.
             if now != was or not now:
-                told[name] = now
+                differences[name] = now
         elif name in choices:
             if kind is not type(was) or _encode(was) != _encode(now):
-                told[name] = _chosen(now)
+                differences[name] = _chosen(now)
         elif type(was) is kind and _has_fields(kind):
             if inner := changes(was, now):
-                told[name] = inner
+                differences[name] = inner
         elif _encode(was) != _encode(now):
-            told[name] = _whole(now)
-    return told
+            differences[name] = _whole(now)
+    return differences
 
 
 def _whole(value: object) -> Any:
@@ -75,16 +75,16 @@ def _has_fields(kind: type) -> bool:
     return hasattr(kind, "__dataclass_fields__") or hasattr(kind, "__struct_fields__")
 
 
-def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
-    """Apply `changes` to `before`; if that is None, `told` has all fields.
+def changed(kind: type[T], before: T | None, differences: Mapping[str, Any]) -> T:
+    """Apply `changes` to `before`; if that is None, `differences` has all fields.
 
-    Numbers that are not finite may be text. Raises ValueError or TypeError if `told` does not fit.
+    Numbers that are not finite may be text. Raises ValueError or TypeError if they do not fit.
     """
     names, values_of, hints, choices = _kind(kind)
     values: dict[str, Any] = {}
     if before is not None:
         values.update(zip(names, values_of(before), strict=True))
-    for name, value in told.items():
+    for name, value in differences.items():
         if name not in hints:
             raise ValueError(f"{kind.__name__} has no {name}")
         was = values.get(name)

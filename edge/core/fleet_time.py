@@ -1,4 +1,4 @@
-"""The fleet's time: the ground's clock, as estimated by each robot.
+"""The fleet's time: the ground's clock as estimated by each robot.
 
 No wall clock is used. The ground echoes the robot's own time of its last received message. The time
 since then is a round trip, so the ground's clock is known to half a round trip, whatever the
@@ -46,14 +46,14 @@ class _Known(Struct, frozen=True):
 class FleetClock:
     """The grounds' clocks relative to one robot's monotonic clock, whose time is `now_s`.
 
-    One thread calls `hear`; the other methods are thread-safe.
+    One thread calls `update`; the other methods are thread-safe.
     """
 
     def __init__(self) -> None:
         # Replaced as a whole; the newest ground is the last entry.
         self._known: dict[int, _Known] = {}
 
-    def hear(
+    def update(
         self, base: int, time_s: float, *, echoed_at_s: float, held_s: float, now_s: float
     ) -> None:
         """Update from a state that the ground `base` sent at `time_s` of its clock.

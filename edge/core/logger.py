@@ -42,9 +42,9 @@ def errors_only() -> Iterator[None]:
 
 def _in_words(_logger: object, _level: str, entry: MutableMapping[str, Any]) -> str:
     event, raised = entry.pop("event"), entry.pop("exc_info", None)
-    said = f"{event} ({raised!r})" if raised else str(event)
+    text = f"{event} ({raised!r})" if raised else str(event)
     details = "".join(f" {key}={value}" for key, value in entry.items())
-    return f"{said}:{details}" if details else said
+    return f"{text}:{details}" if details else text
 
 
 show("warning")

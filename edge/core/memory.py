@@ -116,14 +116,14 @@ class RobotMemory:
             )
             self.explored[x, y] |= seen[np.ix_(in_x, in_y)]
 
-    def hear(self, told: SharedMap) -> None:
+    def merge(self, received: SharedMap) -> None:
         """Merge another robot's shared map, if maps are shared."""
         if self._cells:
-            self._cells.hear(told)
+            self._cells.merge(received)
 
-    def tell(self, position: F64) -> SharedMap | None:
+    def shared_map(self, position: F64) -> SharedMap | None:
         """Shared map of the surroundings of `position`; None if maps are not shared."""
-        return self._cells.tell(position) if self._cells else None
+        return self._cells.around(position) if self._cells else None
 
     def local_map(self, position: F64) -> F32:
         """Map (local_map_size, local_map_size) around `position`, valid until the next call.
@@ -133,8 +133,8 @@ class RobotMemory:
         corner = window_corner(position, self._local.shape[0])
         self._map.window(corner, self._local)
         if self._cells:
-            told = self._cells.importance(corner, self._local.shape[0])
-            np.copyto(self._local, told, where=np.isnan(self._local))
+            shared = self._cells.importance(corner, self._local.shape[0])
+            np.copyto(self._local, shared, where=np.isnan(self._local))
             if not math.isnan(self._unseen):
                 np.copyto(self._local, self._unseen, where=np.isnan(self._local))
         return self._local

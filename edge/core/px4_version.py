@@ -17,7 +17,7 @@ EVIDENCE = {
 def in_words(version: str | None) -> str:
     """Text of a vehicle's version, such as "1.17.0", and how far it was tested."""
     if version is None:
-        return "PX4 did not tell its version"
+        return "PX4 did not report its version"
     number = _number(version)
     newest = ".".join(map(str, max(EVIDENCE)))
     unknown = "too old" if number < OLDEST else f"not tested: newer than {newest}"

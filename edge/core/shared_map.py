@@ -67,7 +67,7 @@ class SharedCells:
     def __init__(self, parameters: PerceptionParameters) -> None:
         """`parameters` must have a `shared_map_cell`."""
         self._cell = parameters.shared_map_cell
-        self._told = parameters.shared_map_side
+        self._shared_side = parameters.shared_map_side
         self._side = -(-parameters.world_size // self._cell)
         self._codes: Codes = np.zeros((self._side, self._side), np.uint8)
 
@@ -95,16 +95,16 @@ class SharedCells:
         here, _ = self._overlap((x, y), (stop_x - x, stop_y - y))
         self._codes[here] = codes[here]
 
-    def hear(self, told: SharedMap) -> None:
+    def merge(self, received: SharedMap) -> None:
         """Fill unknown cells from another robot's map."""
-        here, there = self._overlap(told.corner, told.codes.shape)
+        here, there = self._overlap(received.corner, received.codes.shape)
         known = self._codes[here]
-        np.copyto(known, told.codes[there], where=known == 0)
+        np.copyto(known, received.codes[there], where=known == 0)
 
-    def tell(self, position: F64) -> SharedMap:
+    def around(self, position: F64) -> SharedMap:
         """Known surroundings of `position` (2,), model units, of the local map's size."""
-        x, y = corner = window_corner(position / self._cell, self._told)
-        codes = np.zeros((self._told, self._told), np.uint8)
+        x, y = corner = window_corner(position / self._cell, self._shared_side)
+        codes = np.zeros((self._shared_side, self._shared_side), np.uint8)
         here, there = self._overlap(corner, codes.shape)
         codes[there] = self._codes[here]
         return SharedMap((x, y), codes)

@@ -132,8 +132,8 @@ class VehicleState(Struct, frozen=True):
     `warnings` its faults while armed and reasons to take over, both with the most severe first.
     `remote_control`: it receives one.
 
-    `link_lost` is the share of the autopilot's messages lost in the last ten seconds, in steps of 5
-    %, `link_twice` whether they arrive more than once. `ignores_gps`: its estimator is set to
+    `link_lost` is the share of the autopilot's messages lost in the last ten seconds, in steps of
+    0.05, `link_twice` whether they arrive more than once. `ignores_gps`: its estimator is set to
     ignore the receiver. `version` is the firmware's, such as "1.17.0". `result` is the outcome of
     the last completed command.
     """

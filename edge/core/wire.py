@@ -1,21 +1,20 @@
-"""AggregatedMessage <-> the bytes behind the beacon of a robot's message.
+"""AggregatedMessage <-> bytes after the beacon in a robot's message.
 
-Little-endian: a byte for the type, then the payload, and then the map, if robots share maps. The
-type is 1 for float32, 2 for float16, 3 for int8; plus 64 and 128, see below.
+Little-endian: a type byte, the payload, and the map if robots share maps. The type is 1 for
+float32, 2 for float16 or 3 for int8, plus 128 with a map, plus 64 if compressed. With 64, all bytes
+after the type are one raw deflate stream (RFC 1951).
 
-An int8 payload is a float16 for each 64 of its numbers, what a step of theirs comes to, and behind
-them an int8 for each number, how many steps it is.
+An int8 payload has a step size (float16) for each block of 64 numbers, then the number of steps
+(int8) of each number.
 
-128 more in the type: robots share maps, and one begins behind the payload:
+The map follows the payload:
 
 | offset | type | field | unit |
 | --- | --- | --- | --- |
-| 0 | uint32 | the mission that it was seen in: CRC-32 of the trial's name | |
+| 0 | uint32 | the map's mission: CRC-32 of the trial's name | |
 | 4 | 2 x int32 | x, y of its first cell | cells |
 | 12 | uint32 | n, its side | cells |
-| 16 | n x n bytes | the cells, as `edge.core.shared_map` reads them, [x, y] | |
-
-64 more: all behind the type is one raw deflate stream (RFC 1951).
+| 16 | n x n bytes | its cells, as in `edge.core.shared_map`, [x, y] | |
 """
 
 import struct
@@ -32,24 +31,24 @@ from edge.core.shared_map import SharedMap
 
 _MAP = struct.Struct("<I2iI")
 _WITH_MAP, _COMPRESSED = 0x80, 0x40
-# More effort saves 3 % more, and takes half as long again; of few bytes there is little to save.
-_EFFORT, _WORTH_IT = 1, 256
+# A higher level saves 3 % more and takes 1.5 times as long. Short data are not compressed.
+_LEVEL, _LEAST_BYTES = 1, 256
 
 MAX_ROBOT_ID = 2**16 - 1
 
 PayloadType = Literal["float32", "float16", "int8"]
 PAYLOAD_TYPES: tuple[PayloadType, ...] = get_args(PayloadType)
-# Any policy can be sent in these.
+# Any policy's payload can be sent in these types.
 FLOAT_PAYLOADS: tuple[PayloadType, ...] = ("float32", "float16")
 _CODES: dict[int, PayloadType] = dict(enumerate(PAYLOAD_TYPES, 1))
 _FLOATS: dict[PayloadType, np.dtype[Any]] = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2")}
-# Of an int8 payload: so many numbers have one step, and none is more steps than that.
+# int8 payloads: numbers per block, and the largest number of steps.
 _BLOCK, _MOST_STEPS = 64, 127
 _STEP = np.dtype("<f2")
 
 
 class Rejection(StrEnum):
-    """Why the policy did not listen to a message."""
+    """Reason why the policy ignored a message."""
 
     TRUNCATED = "truncated"
     TOO_LONG = "too_long"
@@ -70,11 +69,11 @@ class Rejection(StrEnum):
 def encode(
     message: AggregatedMessage, payload_type: PayloadType, *, as_in_flight: bool = False
 ) -> bytes:
-    """The bytes of `message`.
+    """Encode a message.
 
-    Numbers come out at the receivers as `rounded` says. If one is not finite, they refuse the
-    message. `as_in_flight`: the payload is not compressed, so that a robot which has seen nothing
-    yet, and whose numbers are mostly 0, says about as much as it will in flight.
+    Receivers get the numbers of `rounded`, and refuse a message with one that is not finite. With
+    `as_in_flight` the payload is not compressed: before a robot has seen anything, most numbers are
+    0, and the message then has about the size that it has in flight.
 
     Raises ValueError for another payload type.
     """
@@ -91,7 +90,7 @@ def encode(
         kind |= _WITH_MAP
         (x, y), codes = message.shared
         data += _MAP.pack(message.trial, x, y, len(codes)) + codes.tobytes()
-    if len(data) >= _WORTH_IT:
+    if len(data) >= _LEAST_BYTES:
         stored = payload_size if as_in_flight else 0
         smaller = _deflated(data[:stored], data[stored:])
         if len(smaller) < len(data):
@@ -100,17 +99,17 @@ def encode(
 
 
 def _deflated(stored: bytes, compressed: bytes) -> bytes:
-    """One raw deflate stream of both, the first as it is."""
-    store, deflate = (zlib.compressobj(effort, wbits=-zlib.MAX_WBITS) for effort in (0, _EFFORT))
+    """One raw deflate stream of both, the first part stored uncompressed."""
+    store, deflate = (zlib.compressobj(level, wbits=-zlib.MAX_WBITS) for level in (0, _LEVEL))
     head = store.compress(stored) + store.flush(zlib.Z_SYNC_FLUSH) if stored else b""
     return head + deflate.compress(compressed) + deflate.flush()
 
 
 def rounded(payload: F32, payload_type: PayloadType) -> F32:
-    """Payloads (..., message_size) as they come out at the receivers.
+    """Payloads (..., message_size) as receivers get them.
 
     float16 rounds to nearest and saturates at +-65504. int8 rounds each number to a 127th of the
-    largest among the 64 that it is sent with.
+    largest in its block of 64.
     """
     if payload_type == "int8":
         return _from_steps(*_in_steps(payload))
@@ -133,7 +132,7 @@ def _blocks(length: int) -> int:
 
 
 def _in_steps(payload: F32) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.int8]]:
-    """The step of each block (..., blocks), and of each number how many of them it is (..., n)."""
+    """Step size of each block (..., blocks) and number of steps of each number (..., n)."""
     size = payload.shape[-1]
     blocks = _blocks(size)
     padded = np.zeros((*payload.shape[:-1], blocks * _BLOCK), np.float32)
@@ -171,12 +170,11 @@ def decode(
     payload_limit: float | None = None,
     shared_side: int = 0,
 ) -> AggregatedMessage | Rejection:
-    """The message in `data`, or why it is refused; raises nothing, whatever the bytes.
+    """Decode a message, or return the reason to refuse it. Never raises, whatever the bytes.
 
-    `message_size` is the number of floats that the own network takes, `payload_limit` the largest
-    that one of them can be (None: any that is finite), `shared_side` the side of the map that it
-    takes, in cells (0: none). Payload and map are read-only, and may be views of `data`, which must
-    not change afterwards.
+    `message_size` is the number of floats of the policy's payload, `payload_limit` the largest
+    absolute value (None: any finite one), `shared_side` the side of the map, cells (0: no map).
+    Payload and map are read-only and may be views of `data`, which must not change afterwards.
     """
     view = memoryview(data).toreadonly()
     if not view:
@@ -204,7 +202,7 @@ def decode(
         codes = np.frombuffer(body, np.uint8, side * side, at + _MAP.size)
         shared = SharedMap((x, y), codes.reshape(side, side))
     payload = _payload(body, message_size, payload_type)
-    # NaN where one of them is.
+    # NaN if any number is.
     largest = float(np.abs(payload).max()) if payload.size else 0.0
     if not np.isfinite(largest):
         return Rejection.NON_FINITE
@@ -214,7 +212,7 @@ def decode(
 
 
 def _size(length: int, payload_type: PayloadType, shared_side: int) -> int:
-    """Of payload and map, in bytes."""
+    """Size of payload and map, bytes."""
     size = _MAP.size + shared_side * shared_side if shared_side else 0
     if payload_type == "int8":
         return size + _blocks(length) * _STEP.itemsize + length
@@ -223,11 +221,11 @@ def _size(length: int, payload_type: PayloadType, shared_side: int) -> int:
 
 def deflate(data: bytes) -> bytes:
     """Compress data to one raw deflate stream (RFC 1951)."""
-    return zlib.compress(data, _EFFORT, -zlib.MAX_WBITS)
+    return zlib.compress(data, _LEVEL, -zlib.MAX_WBITS)
 
 
 def inflate(data: bytes | memoryview, size: int) -> memoryview | None:
-    """Decompress one whole raw deflate stream, but at most `size` + 1 bytes; None if it is none."""
+    """Decompress one raw deflate stream, up to `size` + 1 bytes; None for other data."""
     stream = zlib.decompressobj(wbits=-zlib.MAX_WBITS)
     try:
         unpacked = memoryview(stream.decompress(data, size + 1))

@@ -90,13 +90,13 @@ class Consumption:
         """Endurance of a full pack: measured in this or the last flight, else as configured."""
         return self._endurance_s
 
-    def hear(
+    def add(
         self, now_s: float, armed: bool | None, share: float | None, voltage_v: float | None
     ) -> None:
         """Add the autopilot's remaining share and voltage of the battery."""
-        self._share.hear(now_s, share)
+        self._share.add(now_s, share)
         if self._parameters.cells:
-            self._voltage_v.hear(now_s, voltage_v)
+            self._voltage_v.add(now_s, voltage_v)
         if not armed:
             self._armed_at_s = None
             self._samples.clear()
@@ -130,23 +130,23 @@ class _Recent:
     """Readings of one value in the last few seconds, and their median."""
 
     def __init__(self) -> None:
-        self._heard: deque[tuple[float, float | None]] = deque()
+        self._readings: deque[tuple[float, float | None]] = deque()
         # The finite values, ascending.
         self._ordered: list[float] = []
 
-    def hear(self, now_s: float, value: float | None) -> None:
+    def add(self, now_s: float, value: float | None) -> None:
         if value is not None and math.isfinite(value):
             insort(self._ordered, value)
-        self._heard.append((now_s, value))
-        while now_s - self._heard[0][0] > _MEDIAN_S:
-            _, old = self._heard.popleft()
+        self._readings.append((now_s, value))
+        while now_s - self._readings[0][0] > _MEDIAN_S:
+            _, old = self._readings.popleft()
             if old is not None and math.isfinite(old):
                 del self._ordered[bisect_left(self._ordered, old)]
 
     def median(self) -> float | None:
         ordered = self._ordered
         # If the newest reading is missing, the battery is unknown.
-        if not ordered or self._heard[-1][1] is None:
+        if not ordered or self._readings[-1][1] is None:
             return None
         middle, is_odd = divmod(len(ordered), 2)
         return ordered[middle] if is_odd else (ordered[middle - 1] + ordered[middle]) / 2.0

@@ -258,7 +258,7 @@ def required(
         Requirement(
             "NAV_TRAFF_AVOID",
             1,
-            "what PX4 does when an ADS-B receiver tells of traffic; returning robots would meet",
+            "what PX4 does when an ADS-B receiver reports traffic; returning robots would meet",
             values=(1, 0, 4, 3),
             means=_TRAFFIC,
             may_be_absent=True,
@@ -290,7 +290,7 @@ def required(
         Requirement(
             "COM_DISARM_LAND",
             2.0,
-            "s from a landing until the motors stop, late enough to be told of it; 0 or less "
+            "s from a landing until the motors stop, late enough to be reported; 0 or less "
             "is never",
             above=0.5,
             up_to=5.0,

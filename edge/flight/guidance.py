@@ -114,7 +114,7 @@ def guide(
         return _towards(flight.target_m, max(height, clear_m), position_m, limits), Guidance()
     wanted_m_s = np.zeros(3)
     if state is FlightState.RETURN:
-        wanted_m_s[:2] = _homewards(robot, inputs, position_m)
+        wanted_m_s[:2] = _return_velocity(robot, inputs, position_m)
     elif inputs.policy_velocity_m_s is not None:
         wanted_m_s[:2] = inputs.policy_velocity_m_s
     wanted_m_s = limit_acceleration(
@@ -135,10 +135,10 @@ def guide(
         limits,
         robot.fence,
     )
-    remembered = Guidance(np.array([*safe_m_s[:2], 0.0]), recovering)
+    memory = Guidance(np.array([*safe_m_s[:2], 0.0]), recovering)
     if state is FlightState.RETURN:
-        return MissionPosition(_vector(position_m + safe_m_s * _AHEAD_S)), remembered
-    return MissionVelocity(_vector(safe_m_s)), remembered
+        return MissionPosition(_vector(position_m + safe_m_s * _AHEAD_S)), memory
+    return MissionVelocity(_vector(safe_m_s)), memory
 
 
 def _stay(robot: Robot, flight: FlightMemory, height_m: float) -> MissionVelocity:
@@ -226,7 +226,7 @@ def _hold(
     return goal, Guidance(recovering=recovering, parted=parted)
 
 
-def _homewards(robot: Robot, inputs: FlightInputs, position_m: F64) -> F64:
+def _return_velocity(robot: Robot, inputs: FlightInputs, position_m: F64) -> F64:
     """Velocity (2,) towards the place of landing, 0 before the robot is at its own height."""
     if abs(position_m[2] - robot.parameters.slot_height_m) >= _AT_OWN_HEIGHT_M:
         return np.zeros(2)

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.flight.margins import ErrorBudget, places_apart
-from edge.flight.silence import SilenceLimits, stops_m, strays_m
+from edge.flight.silence import SilenceLimits, deviation_m, possible_places_m
 from edge.messages.beacon import Beacon, Neighbour
 from edge.messages.mission import FlightState
 
@@ -29,17 +29,17 @@ _GRID_M = 2.0
 class StandingRobot(NamedTuple):
     """Another robot on the ground, motors off: its place and its own landing point.
 
-    It may be up to `strays_m` beside the place.
+    It may be up to `deviation_m` beside the place.
     """
 
     robot_id: int
     place_m: Point
     landing_point_m: Point
-    strays_m: float = 0.0
+    deviation_m: float = 0.0
 
     def away_m(self, place_m: Point) -> float:
         """Least distance from a place."""
-        return math.dist(self.place_m, place_m) - self.strays_m
+        return math.dist(self.place_m, place_m) - self.deviation_m
 
     @property
     def is_on_its_own(self) -> bool:
@@ -57,7 +57,7 @@ def standing_robots(beacons: Iterable[Beacon]) -> list[StandingRobot]:
     ]
 
 
-def may_stand(
+def possible_landings(
     silent: Neighbour, its_landing_point_m: Point, limits: SilenceLimits
 ) -> list[StandingRobot]:
     """Places where a robot that fell silent in flight may stand, after landing on its way.
@@ -66,8 +66,10 @@ def may_stand(
     """
     stopped = replace(silent, age_s=max(silent.age_s, limits.flies_on_s))
     return [
-        StandingRobot(silent.robot_id, (x_m, y_m), its_landing_point_m, strays_m(stopped, limits))
-        for x_m, y_m in stops_m(stopped, limits).tolist()
+        StandingRobot(
+            silent.robot_id, (x_m, y_m), its_landing_point_m, deviation_m(stopped, limits)
+        )
+        for x_m, y_m in possible_places_m(stopped, limits).tolist()
     ]
 
 
@@ -98,7 +100,7 @@ def place_to_land(
         return None
     apart_m = places_apart(errors.position_m, errors.position_m).least_m
     taken_m = np.array([*(each.place_m for each in standing), *others_m])
-    strayed_m = np.array([*(each.strays_m for each in standing), *(0.0 for _ in others_m)])
+    strayed_m = np.array([*(each.deviation_m for each in standing), *(0.0 for _ in others_m)])
     if before_m is not None:
         kept_m = float((np.hypot(*(taken_m - before_m).T) - strayed_m).min())
         if kept_m >= apart_m - min(_KEPT_M, _KEPT_SHARE * apart_m):

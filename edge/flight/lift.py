@@ -66,7 +66,7 @@ class Lift(Struct, frozen=True):
         return replace(self, slack_m=math.inf, off_since_s=self.off_since_s if steered else None)
 
 
-def look(lift: Lift, motion: Motion, now_s: float, dt_s: float) -> Lift:
+def update(lift: Lift, motion: Motion, now_s: float, dt_s: float) -> Lift:
     """The state after a tick that came `dt_s` after the last one."""
     dt_s = min(max(dt_s, 0.0), _LONGEST_TICK_S)
     off_m = math.nan

@@ -45,7 +45,7 @@ class OrderRule:
     name. `trial`: the order's effect on the mission.
     """
 
-    taken_in: tuple[FlightState, ...]
+    states: tuple[FlightState, ...]
     first: tuple[_Check, ...] = ()
     checks: tuple[_Check, ...] = ()
     from_anybody: bool = False
@@ -135,24 +135,24 @@ def _cannot_start(t: Tick) -> Refusal | None:
 
 ORDERS: Mapping[str, OrderRule] = {
     "takeoff": OrderRule(
-        taken_in=(_S.PREFLIGHT,), checks=(_other_release, _ground_commands, _not_ready), arms=True
+        states=(_S.PREFLIGHT,), checks=(_other_release, _ground_commands, _not_ready), arms=True
     ),
     "start": OrderRule(
-        taken_in=(_S.HOLD,),
+        states=(_S.HOLD,),
         checks=(_other_release, _ground_commands, _not_a_member, _not_in_place, _cannot_start),
         trial="begins",
     ),
     # Also in PILOT, where it has no effect.
-    "pilot": OrderRule(taken_in=(_S.HOLD, _S.MISSION, _S.RETURN, _S.PILOT)),
+    "pilot": OrderRule(states=(_S.HOLD, _S.MISSION, _S.RETURN, _S.PILOT)),
     "rejoin": OrderRule(
-        taken_in=(_S.PILOT,), checks=(_other_release, _ground_commands, _not_in_place)
+        states=(_S.PILOT,), checks=(_other_release, _ground_commands, _not_in_place)
     ),
     "reset": OrderRule(
-        taken_in=tuple(s for s in _S if s not in (_S.ARMING, _S.TAKEOFF, _S.MISSION)),
+        states=tuple(s for s in _S if s not in (_S.ARMING, _S.TAKEOFF, _S.MISSION)),
         moves_nothing=True, trial="forgotten",
     ),
-    "disarm": OrderRule(taken_in=(_S.ARMING, *AIRBORNE, _S.PILOT), first=(_cannot_disarm,)),
-    "kill": OrderRule(taken_in=tuple(_S), from_anybody=True),
+    "disarm": OrderRule(states=(_S.ARMING, *AIRBORNE, _S.PILOT), first=(_cannot_disarm,)),
+    "kill": OrderRule(states=tuple(_S), from_anybody=True),
 }  # fmt: skip
 
 
@@ -186,11 +186,12 @@ def refusal(t: Tick, order: Order) -> Refusal | None:
     first = _first_problem(t, rule.first)
     if first is not None:
         return first
-    state, sources = t.flight.state, rule.taken_in
-    if state not in sources:
-        alone = f"taken in {sources[0]} only, the robot is" if len(sources) == 1 else "not taken"
+    state = t.flight.state
+    if state not in rule.states:
+        only = len(rule.states) == 1
+        where = f"accepted in {rule.states[0]} only; the robot is" if only else "not accepted"
         return Refusal(
-            RefusalCode.WRONG_STATE, f"{order.kind} is {alone} in {state}: {t.flight.reason.text}"
+            RefusalCode.WRONG_STATE, f"{order.kind} is {where} in {state}: {t.flight.reason.text}"
         )
     if order.expires_at_uptime_s <= t.flight.obeyed_expiry_s:
         return Refusal(RefusalCode.OLDER, "older than an order that was obeyed")

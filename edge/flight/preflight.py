@@ -19,7 +19,7 @@ from edge.flight.landing import in_the_way, standing_robots
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
 from edge.flight.safety import SeparationLimits
-from edge.flight.silence import highest_still_m, nearest_on_way_m, strays_m
+from edge.flight.silence import deviation_m, highest_possible_m, nearest_place_m
 from edge.messages.beacon import Beacon, Neighbour, ReceivedBeacon, tag
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
@@ -385,10 +385,10 @@ def _may_come_down(inputs: PreflightInputs) -> Iterator[FailedCheck]:
         return
     place_m, limits = np.array(inputs.position_m[:2]), inputs.separation.silence
     for silent in inputs.fell_silent:
-        near_m = nearest_on_way_m(silent, limits, place_m)
+        near_m = nearest_place_m(silent, limits, place_m)
         apart_m = float(np.hypot(*(near_m - place_m)))
-        least_m = inputs.separation.landed_m + strays_m(silent, limits)
-        if apart_m < least_m and highest_still_m(silent, limits) > 0.0:
+        least_m = inputs.separation.landed_m + deviation_m(silent, limits)
+        if apart_m < least_m and highest_possible_m(silent, limits) > 0.0:
             yield FailedCheck(
                 CheckCode.SILENT_NEAR,
                 f"robot {silent.robot_id} fell silent in flight, and may come down here: wait "

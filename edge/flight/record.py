@@ -18,7 +18,7 @@ from edge.flight.step import Decision
 from edge.messages.codes import Reason
 
 # Every 10 s at 10 Hz.
-_WHOLE_EVERY = 100
+_COMPLETE_EVERY = 100
 
 
 class TickError(ValueError):
@@ -76,9 +76,9 @@ class TickWriter:
 
     def message(self, tick: FlightTick) -> dict[str, Any]:
         """Message of plain values."""
-        last = self._last if self._number % _WHOLE_EVERY else None
-        given = changes(None if last is None else _left(last), tick.given)
-        made = changes(None if last is None else _begun(last, tick.given), tick.made)
+        last = self._last if self._number % _COMPLETE_EVERY else None
+        given = changes(None if last is None else _next_inputs(last), tick.given)
+        made = changes(None if last is None else _next_result(last, tick.given), tick.made)
         message = {"number": self._number, "whole": last is None, "given": given, "made": made}
         self._last, self._number = tick, self._number + 1
         return message
@@ -99,8 +99,8 @@ class TickReader:
                 self._last = None
                 return None
             last = None if whole else self._last
-            given = changed(Given, None if last is None else _left(last), message["given"])
-            base = None if last is None else _begun(last, given)
+            given = changed(Given, None if last is None else _next_inputs(last), message["given"])
+            base = None if last is None else _next_result(last, given)
             self._last = FlightTick(given, changed(Made, base, message["made"]))
         except KeyError as error:
             raise TickError(f"{error} is missing") from None
@@ -110,11 +110,11 @@ class TickReader:
         return self._last
 
 
-def _left(last: FlightTick) -> Given:
-    """Inputs of the next tick without changes."""
+def _next_inputs(last: FlightTick) -> Given:
+    """Inputs of the next tick if nothing changes."""
     return replace(last.given, flight=last.made.flight, guidance=last.made.guidance)
 
 
-def _begun(last: FlightTick, given: Given) -> Made:
-    """Result of this tick without changes."""
+def _next_result(last: FlightTick, given: Given) -> Made:
+    """Result of this tick if nothing changes."""
     return replace(last.made, flight=given.flight, guidance=given.guidance)

@@ -23,7 +23,7 @@ from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.schema import Bounded, NonNegative, Positive
 from edge.core.vehicle import Vector
-from edge.flight.silence import SilenceLimits, highest_still_m, nearest_on_way_m, strays_m
+from edge.flight.silence import SilenceLimits, deviation_m, highest_possible_m, nearest_place_m
 from edge.messages.beacon import Neighbour
 
 _ABSURD = 1e6
@@ -232,7 +232,7 @@ def brake(
         return np.zeros(3)
     if not all(map(_is_known, (*neighbours, *silent))):
         return np.zeros(3)
-    near = _who_is_near(position_m, velocity_m_s, neighbours, silent, separation, limits)
+    near = _near_robots(position_m, velocity_m_s, neighbours, silent, separation, limits)
     return _kept_apart(near, position_m, velocity_m_s, wanted_m_s, limits, fence)
 
 
@@ -256,7 +256,7 @@ def make_room(
     known = [each for each in neighbours if _is_known(each)]
     if not lands:
         return brake(position_m, velocity_m_s, wanted_m_s, known, (), separation, limits, fence)
-    near = _who_is_near(position_m, velocity_m_s, known, (), separation, limits)
+    near = _near_robots(position_m, velocity_m_s, known, (), separation, limits)
     for neighbour in known:
         offset_m = np.array(_extrapolated(neighbour)[:2]) - position_m[:2]
         apart_m = math.hypot(*offset_m)
@@ -291,7 +291,7 @@ class _Way(NamedTuple):
     at_most: float
 
 
-def _who_is_near(
+def _near_robots(
     position_m: F64,
     velocity_m_s: F64,
     neighbours: Sequence[Neighbour],
@@ -318,10 +318,10 @@ def _who_is_near(
             slack_m = (math.hypot(*here_m) - needed_m) / 2.0
             near.append(_Near(here_m, slack_m, max(slack_m, 0.0), from_rest=False))
     for robot in silent:
-        highest_m = highest_still_m(robot, separation.silence)
+        highest_m = highest_possible_m(robot, separation.silence)
         if position_m[2] < highest_m + separation.passing_height_m:
-            stopped_m = nearest_on_way_m(robot, separation.silence, rest_m)
-            least_m = separation.landed_m + strays_m(robot, separation.silence)
+            stopped_m = nearest_place_m(robot, separation.silence, rest_m)
+            least_m = separation.landed_m + deviation_m(robot, separation.silence)
             near.append(_to_leave(stopped_m - rest_m, least_m, separation, from_rest=True))
     return near
 

@@ -13,11 +13,11 @@ from edge.messages.beacon import Beacon, Neighbour
 from edge.messages.mission import FlightState
 
 # Slower than any landing of PX4, whose last metres take 0.7 m/s.
-_COMES_DOWN_M_S = 0.5
-_APART_M = 2.0
-# It may turn on a mission: of 48 simulated robots 90 % stopped within 2.2 m of the extrapolated way
-# of up to 5.9 m, and all within 3.0 m.
-_STRAYS_SHARE = 0.5
+_DESCENT_M_S = 0.5
+_PLACES_APART_M = 2.0
+# It may turn on a mission. Of 48 simulated robots, 90 % stopped within 2.2 m of the extrapolated
+# way of up to 5.9 m, and all within 3.0 m.
+_DEVIATION_SHARE = 0.5
 _CLIMBS = (FlightState.ARMING, FlightState.TAKEOFF, FlightState.RETURN)
 
 
@@ -34,8 +34,8 @@ class SilenceLimits(NamedTuple):
     hovers_s: float
 
 
-def last_word(beacon: Beacon, limits: SilenceLimits) -> Neighbour | None:
-    """Its last place, at its own height if it climbs there; None without a place."""
+def last_state(beacon: Beacon, limits: SilenceLimits) -> Neighbour | None:
+    """Its last position and velocity, at its own height if it was climbing; None if unknown."""
     if not beacon.armed or beacon.position_m is None or beacon.velocity_m_s is None:
         return None
     x_m, y_m, height_m = beacon.position_m
@@ -51,20 +51,20 @@ def last_word(beacon: Beacon, limits: SilenceLimits) -> Neighbour | None:
     )
 
 
-def highest_still_m(silent: Neighbour, limits: SilenceLimits) -> float:
+def highest_possible_m(silent: Neighbour, limits: SilenceLimits) -> float:
     """Its greatest possible height; 0 or less if it is down."""
-    comes_down_s = max(silent.age_s - limits.hovers_s, 0.0)
-    return silent.position_m[2] - _COMES_DOWN_M_S * comes_down_s
+    descends_s = max(silent.age_s - limits.hovers_s, 0.0)
+    return silent.position_m[2] - _DESCENT_M_S * descends_s
 
 
-def stops_m(silent: Neighbour, limits: SilenceLimits) -> F64:
+def possible_places_m(silent: Neighbour, limits: SilenceLimits) -> F64:
     """Its possible places (n, 2) on a straight way, at most 2 m apart."""
     first_m, along_m = _way_m(silent, limits)
-    count = math.ceil(math.hypot(*along_m) / _APART_M) + 1
+    count = math.ceil(math.hypot(*along_m) / _PLACES_APART_M) + 1
     return first_m + np.linspace(0.0, 1.0, count)[:, None] * along_m
 
 
-def nearest_on_way_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> F64:
+def nearest_place_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> F64:
     """The nearest of its possible places to a place, (2,)."""
     first_m, along_m = _way_m(silent, limits)
     square = float(along_m @ along_m)
@@ -72,10 +72,10 @@ def nearest_on_way_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> 
     return first_m + along_m * min(max(share, 0.0), 1.0)
 
 
-def strays_m(silent: Neighbour, limits: SilenceLimits) -> float:
-    """Largest distance beside that way."""
+def deviation_m(silent: Neighbour, limits: SilenceLimits) -> float:
+    """Largest deviation from the straight way."""
     _, along_m = _way_m(silent, limits)
-    return _STRAYS_SHARE * math.hypot(*along_m)
+    return _DEVIATION_SHARE * math.hypot(*along_m)
 
 
 def _way_m(silent: Neighbour, limits: SilenceLimits) -> tuple[F64, F64]:

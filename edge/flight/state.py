@@ -272,7 +272,7 @@ class Robot:
             hovers_s=lands_after_s + _LANDS_WITHIN_S,
         )
 
-    def told(self, ground: GroundState) -> tuple[Fence, Place]:
+    def fence_and_place(self, ground: GroundState) -> tuple[Fence, Place]:
         """Fence and place from the ground's state, by default its own."""
         fence = self.fence if ground.fence is None else ground.fence
         place = ground.places.get(str(self.robot_id))
@@ -280,7 +280,7 @@ class Robot:
 
     def assigned(self, ground: GroundState) -> "Robot":
         """The robot with these. Raises ValueError, for the operator, if they do not fit."""
-        fence, place = self.told(ground)
+        fence, place = self.fence_and_place(ground)
         try:
             parameters = replace(
                 self.parameters, slot=place.slot, landing_point_m=place.landing_point_m
@@ -298,7 +298,7 @@ class Tick(Struct, frozen=True, eq=False):
     inputs: FlightInputs
 
     @property
-    def comes_down_m(self) -> tuple[float, ...]:
+    def landing_place_m(self) -> tuple[float, ...]:
         """Destination of RETURN, (2,): the landing point, or beside it."""
         return self.inputs.lands_beside_m or self.robot.parameters.landing_point_m
 
@@ -311,7 +311,7 @@ class Tick(Struct, frozen=True, eq=False):
         return self.inputs.vehicle.mode
 
     @property
-    def heard_since_entry(self) -> bool:
+    def heartbeat_since_entry(self) -> bool:
         return self.inputs.vehicle.heartbeat_at_s > self.flight.since_s
 
     @property

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from edge.core.vehicle import Action, Mode, Vector, VehicleState
 from edge.flight.alarms import alarms
-from edge.flight.lift import Lift, Motion, look
+from edge.flight.lift import Lift, Motion, update
 from edge.flight.orders import ORDERS, answered, new_order, obeyed, refusal
 from edge.flight.state import (
     STALE_TELEMETRY_S,
@@ -52,7 +52,7 @@ class Decision(NamedTuple):
 
 def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
     """One control tick: at most one transition, and requests to the autopilot."""
-    flight = _look(Tick(robot, flight, inputs))
+    flight = _observed(Tick(robot, flight, inputs))
     order = new_order(robot, flight, inputs)
     tick = Tick(robot, flight, inputs)
     refused = None if order is None else refusal(tick, order)
@@ -71,7 +71,7 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
     if taken is not None:
         flight, new_trial = obeyed(flight, taken)
     tick = Tick(robot, flight, inputs)
-    asked, of_gps = _ask(tick), _ask_of_gps(tick)
+    asked, of_gps = _requests(tick), _gps_requests(tick)
     flight = replace(
         flight,
         tick_at_s=inputs.now_s,
@@ -84,18 +84,18 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
     return Decision(flight, actions + asked + of_gps, alarms(tick), new_trial, row)
 
 
-def _look(t: Tick) -> FlightMemory:
+def _observed(t: Tick) -> FlightMemory:
     """Update the memory from this tick's inputs, before any transition."""
     flight, inputs, now_s = t.flight, t.inputs, t.inputs.now_s
     vehicle = inputs.vehicle
     if t.lapse_s > 0.0:
         flight = replace(flight, silent_until_s=now_s + STALE_TELEMETRY_S)
     if vehicle.heartbeat_at_s > t.acts_from_s + _STREAM_S and not is_silent(flight, now_s):
-        flight = _with(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
+        flight = _updated(flight, reached=flight.reached or _is_reached(flight.state, vehicle))
     if not is_silent(flight, now_s) and (flight.reached or flight.state not in STEERED):
-        flight = _with(flight, silent_until_s=-math.inf)
+        flight = _updated(flight, silent_until_s=-math.inf)
     disarmed = vehicle.connected and vehicle.armed is False
-    flight = _with(
+    flight = _updated(
         flight,
         lift=_lift(t),
         ground_at_s=now_s if t.ground_heard else flight.ground_at_s,
@@ -104,17 +104,17 @@ def _look(t: Tick) -> FlightMemory:
     )
     landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
     down = flight.state is _S.LAND and in_air(flight, vehicle, now_s) is False
-    flight = _with(flight, landed_since_s=landed_since_s if down else None)
+    flight = _updated(flight, landed_since_s=landed_since_s if down else None)
     if failsafe_acts(vehicle):
         flight = replace(flight, failsafe_at_s=now_s)
         if flight.state is _S.LAND and flight.reached and vehicle.mode is not Mode.LAND:
             # PX4 continues to land; if it does not, it is requested again.
             flight = replace(flight, reached=False, asked_at_s=now_s)
     # Telemetry from before arming was called off has arrived by then.
-    looked = vehicle.heartbeat_at_s > flight.since_s + STALE_TELEMETRY_S
-    if disarmed and flight.state in ON_GROUND and looked:
-        flight = _with(flight, armed_by="")
-    flight = _with(flight, alone_since_s=_alone_since_s(t))
+    reported = vehicle.heartbeat_at_s > flight.since_s + STALE_TELEMETRY_S
+    if disarmed and flight.state in ON_GROUND and reported:
+        flight = _updated(flight, armed_by="")
+    flight = _updated(flight, alone_since_s=_unattended_since_s(t))
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))
     return flight
@@ -135,10 +135,10 @@ def _lift(t: Tick) -> Lift:
         in_air=inputs.vehicle.in_air,
         ground_below_m=t.robot.errors.height_m,
     )
-    return look(flight.lift, motion, inputs.now_s, inputs.now_s - flight.tick_at_s)
+    return update(flight.lift, motion, inputs.now_s, inputs.now_s - flight.tick_at_s)
 
 
-def _with(flight: FlightMemory, **changes: Any) -> FlightMemory:
+def _updated(flight: FlightMemory, **changes: Any) -> FlightMemory:
     """Replace fields; returns the same memory if nothing changes, the usual case."""
     for name, value in changes.items():
         if getattr(flight, name) != value:
@@ -146,7 +146,7 @@ def _with(flight: FlightMemory, **changes: Any) -> FlightMemory:
     return flight
 
 
-def _alone_since_s(t: Tick) -> float | None:
+def _unattended_since_s(t: Tick) -> float | None:
     flight, now_s, order = t.flight, t.inputs.now_s, t.inputs.order
     ordered = order is not None and order.robot_id == t.robot.robot_id
     taken = flight.state is _S.PILOT and t.mode is not Mode.HOLD
@@ -156,7 +156,7 @@ def _alone_since_s(t: Tick) -> float | None:
     return now_s if begins and flight.alone_since_s is None else flight.alone_since_s
 
 
-def _as_needed(state: FlightState, vehicle: VehicleState) -> bool:
+def _is_reached(state: FlightState, vehicle: VehicleState) -> bool:
     if state is _S.FAULT:
         return vehicle.armed is False
     return vehicle.mode is (Mode.LAND if state is _S.LAND else Mode.OFFBOARD)
@@ -175,9 +175,9 @@ def enter(row: Transition, reason: str, t: Tick) -> FlightMemory:
     """The memory at the begin of the row's target; `reason` is its text."""
     flight, now_s = t.flight, t.inputs.now_s
     from_offboard = flight.state in (_S.ARMING, *STEERED)
-    stays_offboard = from_offboard and row.target in STEERED and not row.looks_anew
+    stays_offboard = from_offboard and row.target in STEERED and not row.drops_observations
     in_hold = t.mode is Mode.HOLD
-    alone = row.left_alone == "yes" or (row.left_alone == "if in hold" and in_hold)
+    alone = row.unattended == "yes" or (row.unattended == "if in hold" and in_hold)
     alone_since_s = now_s if flight.alone_since_s is None else flight.alone_since_s
     return replace(
         flight,
@@ -242,36 +242,36 @@ def _target_m(t: Tick) -> Vector | None:
     return x_m, y_m, height if target_m is None or led_away else target_m[2]
 
 
-def _ask(t: Tick) -> tuple[Action, ...]:
+def _requests(t: Tick) -> tuple[Action, ...]:
     """Commands that the state requires, repeated until done; ARM is requested once."""
     flight, now_s = t.flight, t.inputs.now_s
     streamed = t.could_follow_s >= _STREAM_S
     if flight.state is _S.LAND:
         since_s = flight.landed_since_s
         if since_s is not None and now_s - since_s > _LANDED_DISARM_S:
-            return _again(t, Action.DISARM)
+            return _repeated(t, Action.DISARM)
         asked_lately = now_s - flight.asked_at_s < t.robot.parameters.hover_land_s
         if flight.reached or (t.failsafe_acts and (t.mode is Mode.LAND or asked_lately)):
             return ()
-        return _again(t, Action.LAND)
+        return _repeated(t, Action.LAND)
     if flight.state is _S.FAULT:
-        return _again(t, Action.KILL) if flight.killed and not flight.reached else ()
+        return _repeated(t, Action.KILL) if flight.killed and not flight.reached else ()
     if flight.state is _S.ARMING and flight.reached:
         return () if flight.armed_asked else (Action.ARM,)
     if flight.state in ON_GROUND and t.inputs.vehicle.armed is False:
         # PX4 would not arm again in the mode at the end of a flight.
-        stuck = t.heard_since_entry and t.mode in (Mode.OFFBOARD, Mode.LAND, Mode.RETURN)
-        return _again(t, Action.HOLD) if stuck else ()
+        stuck = t.heartbeat_since_entry and t.mode in (Mode.OFFBOARD, Mode.LAND, Mode.RETURN)
+        return _repeated(t, Action.HOLD) if stuck else ()
     if t.silent and flight.state in STEERED:
         # Without setpoints it would land. Before telemetry, a pilot may have it.
-        flies_on = t.mode is Mode.OFFBOARD and t.heard_since_entry
-        return _again(t, Action.HOLD) if flies_on else ()
+        flies_on = t.mode is Mode.OFFBOARD and t.heartbeat_since_entry
+        return _repeated(t, Action.HOLD) if flies_on else ()
     if flight.state in (_S.ARMING, *STEERED) and streamed and not flight.reached:
-        return _again(t, Action.OFFBOARD)
+        return _repeated(t, Action.OFFBOARD)
     return ()
 
 
-def _ask_of_gps(t: Tick) -> tuple[Action, ...]:
+def _gps_requests(t: Tick) -> tuple[Action, ...]:
     """Make the estimator ignore a receiver while that contradicts itself.
 
     PX4 then keeps its place by its other sensors for seconds, and its height after that. Only this
@@ -286,10 +286,10 @@ def _ask_of_gps(t: Tick) -> tuple[Action, ...]:
     return (Action.USE_GPS,) if t.flight.gps_ignored and vehicle.ignores_gps else ()
 
 
-def _again(t: Tick, action: Action) -> tuple[Action, ...]:
+def _repeated(t: Tick, action: Action) -> tuple[Action, ...]:
     asked_at_s = t.flight.asked_at_s
     if t.inputs.now_s - asked_at_s < _ASK_AGAIN_S:
         return ()
     # Modes are requested again only after telemetry: a pilot may have taken the vehicle.
-    looked = t.inputs.vehicle.heartbeat_at_s > asked_at_s + _STREAM_S
-    return (action,) if looked or action in (Action.DISARM, Action.KILL) else ()
+    reported = t.inputs.vehicle.heartbeat_at_s > asked_at_s + _STREAM_S
+    return (action,) if reported or action in (Action.DISARM, Action.KILL) else ()

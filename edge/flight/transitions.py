@@ -46,10 +46,10 @@ class Transition:
 
     A row with `order` applies only in a tick that obeys such an order. `actions` are requested once
     from the autopilot. `alarm`: the operator must see the reason while the target lasts. `land_by`
-    is the origin of a landing. `left_alone`: whether the vehicle then hovers without anybody's
-    command. `looks_anew`: earlier observations of a vehicle that this program continues to steer
-    are dropped. `keeps_target`: keep the target of the state before. `rejoins`: a pilot's mode is
-    to be ended. `kills`: the motors stop for good.
+    is the origin of a landing. `unattended`: whether the vehicle then hovers without anybody's
+    command. `drops_observations`: earlier observations of the steered vehicle no longer count.
+    `keeps_target`: keep the target of the state before. `rejoins`: end the pilot's mode. `kills`:
+    the motors stop for good.
     """
 
     sources: tuple[FlightState, ...]
@@ -62,8 +62,8 @@ class Transition:
     actions: tuple[Action, ...] = ()
     alarm: bool = False
     land_by: LandBy = "safety"
-    left_alone: Literal["no", "if in hold", "yes"] = "no"
-    looks_anew: bool = False
+    unattended: Literal["no", "if in hold", "yes"] = "no"
+    drops_observations: bool = False
     keeps_target: bool = False
     rejoins: bool = False
     kills: bool = False
@@ -96,8 +96,8 @@ def _disarmed_again(t: Tick) -> str | None:
 
 
 def _armed_before(t: Tick) -> str | None:
-    whose = _armed_by_us(t) or "the vehicle was already armed when this program found it"
-    text = f"{whose}: only observing; rejoin it, or a pilot lands it"
+    cause = _armed_by_us(t) or "the vehicle was already armed when this program found it"
+    text = f"{cause}: only observing; rejoin it, or a pilot lands it"
     return reason_if(t.inputs.vehicle.armed is True, text)
 
 
@@ -116,7 +116,7 @@ def _armed_by_us(t: Tick) -> str:
 
 
 def _armed_again(t: Tick) -> str | None:
-    answers = t.inputs.vehicle.connected and t.heard_since_entry and not t.flight.killed
+    answers = t.inputs.vehicle.connected and t.heartbeat_since_entry and not t.flight.killed
     return _armed_by_others(t) if answers else None
 
 
@@ -140,7 +140,7 @@ def _left_land(t: Tick) -> str | None:
 
 
 def _failsafe_takes(t: Tick) -> str | None:
-    known = t.flight.reached or t.heard_since_entry
+    known = t.flight.reached or t.heartbeat_since_entry
     return failsafe(t) if known and t.mode is not Mode.LAND else None
 
 
@@ -165,7 +165,7 @@ def _position_lost(t: Tick) -> str | None:
 
 
 def _on_ground(t: Tick) -> str | None:
-    # No repeated command of the ground may lift a vehicle off.
+    # A repeated command of the ground must not lift a vehicle off.
     return reason_if(t.in_air is False and not t.silent, "it stands on the ground")
 
 
@@ -219,7 +219,7 @@ def _lands_without_remote_control(t: Tick) -> str | None:
 
 def _ground_long_lost(t: Tick) -> str | None:
     parameters = t.robot.parameters
-    # Not by the newest message's age: if all messages are late, that would never grow.
+    # Not by the newest message's age, which does not grow if all messages are late.
     at_s, age_s = t.flight.ground_at_s, t.inputs.ground_age_s
     never = at_s == -math.inf
     lost_s = age_s - parameters.ground_timeout_s if never else t.inputs.now_s - at_s
@@ -242,7 +242,7 @@ def _px4_stays_changed(t: Tick) -> str | None:
     return px4_changed(t) if stays and _free_to_return(t) else None
 
 
-def _left_alone(t: Tick) -> str | None:
+def _unattended(t: Tick) -> str | None:
     since_s, limit_s = t.flight.alone_since_s, t.robot.parameters.hover_land_s
     if since_s is None or t.silent or t.in_air is not True:
         return None
@@ -324,7 +324,7 @@ def _at_landing_point(t: Tick) -> str | None:
     odometry = t.inputs.odometry
     if odometry is None:
         return None
-    away_m = math.dist(odometry.position_m[:2], t.comes_down_m)
+    away_m = math.dist(odometry.position_m[:2], t.landing_place_m)
     speed_m_s = math.hypot(*odometry.velocity_m_s[:2])
     return reason_if(
         away_m < _AT_LANDING_POINT_M and speed_m_s < _AT_REST_M_S, "at the landing point"
@@ -359,25 +359,25 @@ TRANSITIONS: tuple[Transition, ...] = (
                _link_lost, actions=(Action.DISARM,)),
     Transition((_S.INIT,), _S.PILOT, _R.ARMED_BEFORE,
                "the vehicle is armed when the program finds it", _armed_before, alarm=True,
-               left_alone="if in hold"),
+               unattended="if in hold"),
     Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED, _S.ARMING), _S.PILOT, _R.ARMED_BY_OTHERS,
                "the vehicle is armed, not by this program", _armed_by_others, alarm=True),
     Transition((_S.FAULT,), _S.PILOT, _R.ARMED_BEFORE,
                "the autopilot answers again, armed, and was not killed", _armed_again, alarm=True,
-               left_alone="if in hold"),
+               unattended="if in hold"),
     Transition(AIRBORNE, _S.PILOT, _R.PILOT, "a pilot's mode is on", _pilot, alarm=True),
     Transition(STEERED, _S.HOLD, _R.CONTROL_SILENT, "the control loop was silent", _lapse,
-               alarm=True, left_alone="yes", looks_anew=True),
+               alarm=True, unattended="yes", drops_observations=True),
     Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD, _R.FAILSAFE,
                "the autopilot's own failsafe holds or moves the vehicle", _failsafe_takes,
-               alarm=True, left_alone="yes"),
+               alarm=True, unattended="yes"),
     Transition(STEERED, _S.PILOT, _R.LEFT_OFFBOARD, "the vehicle left offboard", _left_offboard,
                alarm=True),
     Transition((_S.LAND,), _S.PILOT, _R.LEFT_LAND, "the vehicle left land", _left_land, alarm=True),
     Transition(STEERED, _S.LAND, _R.AUTOPILOT_LANDS, "the autopilot lands by itself",
                _autopilot_lands, alarm=True),
     Transition((_S.HOLD, _S.RETURN), _S.PILOT, _R.OFFBOARD_REFUSED, "offboard is refused",
-               _offboard_refused, alarm=True, left_alone="if in hold"),
+               _offboard_refused, alarm=True, unattended="if in hold"),
     Transition(STEERED, _S.LAND, _R.POSITION_LOST, "the position is lost", _position_lost,
                alarm=True),
     Transition(STEERED, _S.LAND, _R.BATTERY_CRITICAL, "the battery is critical", _battery_critical,
@@ -420,7 +420,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition((_S.TAKEOFF, _S.HOLD), _S.LAND, _R.GROUND_LOST, "the ground stays lost",
                _ground_long_lost, alarm=True),
     Transition((_S.HOLD, _S.PILOT), _S.LAND, _R.NOBODY_ANSWERED,
-               "it hovers for no reason that anybody gave, and nobody answers", _left_alone,
+               "it hovers without anybody's command, and nobody answers", _unattended,
                alarm=True),
     Transition((_S.HOLD, _S.MISSION), _S.RETURN, _R.PX4_CHANGED,
                "PX4's parameters or fence were changed and not set back, and the ground commands "

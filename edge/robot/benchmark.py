@@ -136,7 +136,7 @@ class _Flight:
         return between_s - began_s, ended_s - between_s
 
     def _receive(self, now_s: float) -> None:
-        self._pac.clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)
+        self._pac.clock.update(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)
         x, y, height = self.odometry().position_m
         for number, (offset, payload) in enumerate(
             zip(self._offsets.tolist(), self._payloads, strict=True), 1

@@ -13,11 +13,11 @@ from edge.core.ports import Camera, Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
-from edge.flight.landing import Point, may_stand, place_to_land, standing_robots
+from edge.flight.landing import Point, place_to_land, possible_landings, standing_robots
 from edge.flight.lift import OFF_HEIGHT_M
 from edge.flight.record import Given, made
 from edge.flight.safety import Closest, nearest
-from edge.flight.silence import SilenceLimits, highest_still_m, last_word
+from edge.flight.silence import SilenceLimits, highest_possible_m, last_state
 from edge.flight.state import (
     FlightInputs,
     FlightMemory,
@@ -146,7 +146,7 @@ class FlightControl:
         neighbours = self._neighbours(peers, now_s)
         silence = self.assignment.robot.silence
         silent = self._silent(peers, neighbours, silence, now_s)
-        self.fell_silent = tuple(each for each in silent if highest_still_m(each, silence) > 0.0)
+        self.fell_silent = tuple(each for each in silent if highest_possible_m(each, silence) > 0.0)
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
@@ -212,7 +212,7 @@ class FlightControl:
             self._ground_time = FleetTime(ground.time_base, ground.time_s, 0.0)
         echo = ground.echoes.get(str(self.assignment.robot.robot_id))
         if echo is not None and echo.boot_nonce == self.assignment.robot.boot_nonce:
-            self._pac.clock.hear(
+            self._pac.clock.update(
                 ground.time_base,
                 ground.time_s,
                 echoed_at_s=self._started_s + echo.uptime_s,
@@ -274,7 +274,7 @@ class FlightControl:
         world_id = now.world_id if ground.world_id is None else ground.world_id
         self.wanted_world_id = None
         if self._has_flown and not (armed is False and self.flight.state in ON_GROUND):
-            fence, place = self._configured.told(ground)
+            fence, place = self._configured.fence_and_place(ground)
             parts = {
                 CheckCode.KEEPS_ORIGIN: ("mission origin", origin, now.origin),
                 CheckCode.KEEPS_FENCE: ("fence", fence, now.robot.fence),
@@ -289,7 +289,7 @@ class FlightControl:
             )
             return
         robot, sensor = now.robot, None
-        moves = self._configured.told(ground) != (robot.fence, robot.place)
+        moves = self._configured.fence_and_place(ground) != (robot.fence, robot.place)
         changes = moves or origin != now.origin
         place_m = self._place_in(origin, vehicle) if changes else None
         if changes and place_m is None and armed is not False:
@@ -419,7 +419,7 @@ class FlightControl:
         return tuple(
             replace(last, age_s=now_s - self._last_flying[robot_id].received_at_s)
             for robot_id in sorted(self._last_flying.keys() - others)
-            if (last := last_word(self._last_flying[robot_id].beacon, silence)) is not None
+            if (last := last_state(self._last_flying[robot_id].beacon, silence)) is not None
         )
 
     def _update_landing_place(
@@ -436,7 +436,9 @@ class FlightControl:
             place
             for each in silent
             if each.age_s > _SILENT_FOR_GOOD_S
-            for place in may_stand(each, others[each.robot_id].landing_point_m, robot.silence)
+            for place in possible_landings(
+                each, others[each.robot_id].landing_point_m, robot.silence
+            )
         ]
         if not standing:
             self._lands_beside_m = None
@@ -472,7 +474,7 @@ class FlightControl:
     def _energy(
         self, now_s: float, vehicle: VehicleState, odometry: Odometry | None
     ) -> Energy | None:
-        self._consumption.hear(now_s, vehicle.armed, vehicle.battery, vehicle.voltage_v)
+        self._consumption.add(now_s, vehicle.armed, vehicle.battery, vehicle.voltage_v)
         robot, way_s = self.assignment.robot, None
         height = height_m(self.flight, odometry)
         if odometry is not None and height is not None:

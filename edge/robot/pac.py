@@ -242,8 +242,8 @@ class Pac:
         trial = self._map_trial
         for (_, message, _), is_near in zip(neighbours, near, strict=True):
             if is_near and message.shared is not None and message.trial == trial:
-                self._memory.hear(message.shared)
-        self._outgoing_map = _OutgoingMap(trial, self._memory.tell(own))
+                self._memory.merge(message.shared)
+        self._outgoing_map = _OutgoingMap(trial, self._memory.shared_map(own))
         # Training keeps robots in the world: outside it, the policy gets the nearest point inside.
         position = clamp_to_world(own, self._perception.world_size)
         velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)

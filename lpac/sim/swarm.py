@@ -227,4 +227,4 @@ class ClockedPac(Pac):
         self.receive(*message, now_s)
 
     def _tell_time(self, now_s: float) -> None:
-        self.clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)
+        self.clock.update(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)

@@ -31,7 +31,7 @@ from lpac.sim.batch.seen import SeenMap, ShownWorld
 def _age_error_s() -> float:
     """Error of a message's age where all robots share one clock, s."""
     clock = FleetClock()
-    clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+    clock.update(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     now = clock.at(0.0)
     age = clock.age_s(now, 0.0) if now else None
     assert age is not None
@@ -212,10 +212,12 @@ class BatchedRobot:
         near = self._in_range(own, heard)
         for (_, message, _), is_near in zip(neighbours, near, strict=True):
             if is_near and message.shared is not None:
-                self._seen.hear(message.shared)
+                self._seen.merge(message.shared)
         velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)
         velocity = self._parameters.scale.velocity_to_model(velocity_m_s)
-        self._look = _Look(now_s, own, self._to_model(heard)[near], velocity, self._seen.tell(own))
+        self._look = _Look(
+            now_s, own, self._to_model(heard)[near], velocity, self._seen.shared_map(own)
+        )
         self._features = None
 
     def inputs(self, now_s: float) -> Inputs | None:

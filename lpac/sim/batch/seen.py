@@ -57,14 +57,14 @@ class SeenMap:
             x0, y0 = self._low
         self._seen[x.start - x0 : x.stop - x0, y.start - y0 : y.stop - y0] = True
 
-    def hear(self, told: SharedMap) -> None:
+    def merge(self, received: SharedMap) -> None:
         """Merge another robot's shared map; do nothing if maps are not shared."""
         if self._cells:
-            self._cells.hear(told)
+            self._cells.merge(received)
 
-    def tell(self, position: F64) -> SharedMap | None:
+    def shared_map(self, position: F64) -> SharedMap | None:
         """Shared map of the surroundings of `position`; None if maps are not shared."""
-        return self._cells.tell(position) if self._cells else None
+        return self._cells.around(position) if self._cells else None
 
     def local_map(self, position: F64, out: F32) -> F32:
         """Fill `out` (local_map_size, local_map_size) around `position` (2,) and return it.

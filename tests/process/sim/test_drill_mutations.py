@@ -95,7 +95,7 @@ def watchdog_waits_5_s(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def landing_points_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
     """Between the ground and the robots, once they fly."""
-    homewards = edge.flight.guidance._homewards
+    homewards = edge.flight.guidance._return_velocity
 
     def to_another(robot: Robot, inputs: Any, position_m: F64) -> F64:
         others = {0: 1, 1: 0}
@@ -106,7 +106,7 @@ def landing_points_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
             position_m,
         )
 
-    monkeypatch.setattr(edge.flight.guidance, "_homewards", to_another)
+    monkeypatch.setattr(edge.flight.guidance, "_return_velocity", to_another)
 
 
 @cache

@@ -566,7 +566,7 @@ def test_script_ends_with_the_step_that_fails_and_holds_the_fleet(field: Command
 
     field.hears(robot, once_it_lands)
     why = field.refused("mission", "run", write_script(field.folder, 600.0), "--yes")
-    assert "trial 1 of 2: mission (steps[2]): r2: pilot is not taken in land" in why
+    assert "trial 1 of 2: mission (steps[2]): r2: pilot is not accepted in land" in why
     assert "hold is commanded, but r2: land: battery critical" in why
     assert "next `lpac mission land`" in why
     assert field.states()[:2] == [_S.HOLD, _S.HOLD]

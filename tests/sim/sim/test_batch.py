@@ -218,10 +218,10 @@ def test_what_was_seen_is_what_a_robot_remembers(
             seen.observe(at)
             memory.observe(at, sensor.view(at))
             if told is not None:
-                seen.hear(told)
-                memory.hear(told)
+                seen.merge(told)
+                memory.merge(told)
             np.testing.assert_array_equal(seen.local_map(at, room), memory.local_map(at))
-            told, also = seen.tell(at), memory.tell(at)
+            told, also = seen.shared_map(at), memory.shared_map(at)
             assert (told is None) == (also is None) == (not tells[1])
             if told and also:
                 assert told.corner == also.corner

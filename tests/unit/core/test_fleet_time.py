@@ -27,7 +27,7 @@ class Exchange:
         """A status that is so long on its way, is held, and comes back; when it did."""
         sent_s = at_s + there_s + held_s
         came_s = sent_s + back_s
-        self.clock.hear(
+        self.clock.update(
             self._base, self.ground_s(sent_s), echoed_at_s=at_s, held_s=held_s, now_s=came_s
         )
         return came_s
@@ -87,14 +87,14 @@ def test_of_another_ground_no_age_is_known() -> None:
 def test_the_newest_ground_counts_and_the_one_before_is_understood() -> None:
     exchange = Exchange(base=GROUND)
     exchange.say(0.0, 0.01, 0.0, 0.01)
-    exchange.clock.hear(OTHER, 500.0, echoed_at_s=1.0, held_s=0.0, now_s=1.0)
+    exchange.clock.update(OTHER, 500.0, echoed_at_s=1.0, held_s=0.0, now_s=1.0)
     newest = exchange.clock.at(1.0)
     assert newest is not None and (newest.base, newest.time_s) == (OTHER, 500.0)
     age = exchange.clock.age_s(FleetTime(GROUND, 1.0, 0.0), 2.0)
     assert age is not None
     assert (age.least_s, age.most_s) == pytest.approx((0.989, 1.011), abs=1e-3)
     for base in range(100, 110):
-        exchange.clock.hear(base, 0.0, echoed_at_s=1.0, held_s=0.0, now_s=1.0)
+        exchange.clock.update(base, 0.0, echoed_at_s=1.0, held_s=0.0, now_s=1.0)
     assert exchange.clock.age_s(FleetTime(GROUND, 1.0, 0.0), 2.0) is None
 
 
@@ -110,5 +110,5 @@ def test_the_newest_ground_counts_and_the_one_before_is_understood() -> None:
 )
 def test_what_cannot_be_is_not_believed(time_s: float, echoed_at_s: float, held_s: float) -> None:
     clock = FleetClock()
-    clock.hear(GROUND, time_s, echoed_at_s=echoed_at_s, held_s=held_s, now_s=1.0)
+    clock.update(GROUND, time_s, echoed_at_s=echoed_at_s, held_s=held_s, now_s=1.0)
     assert clock.at(1.0) is None

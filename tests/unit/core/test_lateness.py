@@ -65,7 +65,7 @@ def test_no_place_that_is_older_than_allowed_is_fresh(
 
     def echo(trip: Trip) -> None:
         clock = clock_of[trip.robot]
-        knows[trip.robot].hear(
+        knows[trip.robot].update(
             GROUND,
             ground.at(trip.echoed_s),
             echoed_at_s=clock.at(trip.said_s),

@@ -285,11 +285,11 @@ def test_of_what_a_camera_did_not_see_nothing_is_known(
     centres = ((np.arange(64) + 0.5) * world_size / 64).astype(int)
     np.testing.assert_array_equal(first.explored, ever[np.ix_(centres, centres)])
     if cell:
-        tells, knows = (memory.tell(position) for memory in (first, whole))
+        tells, knows = (memory.shared_map(position) for memory in (first, whole))
         assert tells is not None and knows is not None
         known = tells.codes != 0
         # A cell of which one look has shown a part is not told.
-        np.testing.assert_array_equal(tells.codes[known], second.tell(position).codes[known])  # type: ignore[union-attr]
+        np.testing.assert_array_equal(tells.codes[known], second.shared_map(position).codes[known])  # type: ignore[union-attr]
         assert not known[knows.codes == 0].any()
 
 
@@ -303,6 +303,6 @@ def test_a_camera_that_sees_everything_is_a_sensor() -> None:
         other.observe(place, view, everywhere)
         np.testing.assert_array_equal(memory.local_map(place), other.local_map(place))
         np.testing.assert_array_equal(memory.explored, other.explored)
-        mine, its = memory.tell(place), other.tell(place)
+        mine, its = memory.shared_map(place), other.shared_map(place)
         assert mine is not None and its is not None
         np.testing.assert_array_equal(mine.codes, its.codes)

@@ -69,7 +69,7 @@ def look(memory: RobotMemory, place: tuple[float, float], importance: float) -> 
     """The sensor shows the same everywhere; what is told then."""
     position = np.array(place)
     memory.observe(position, np.full((64, 64), importance, np.float32))
-    told = memory.tell(position)
+    told = memory.shared_map(position)
     assert told is not None
     return told
 
@@ -84,10 +84,10 @@ def test_news_goes_from_robot_to_robot_and_does_not_grow() -> None:
     first, second, third = (RobotMemory(PARAMETERS) for _ in range(3))
     told = look(first, (160.0, 160.0), 0.5)
     assert told.codes.shape == (32, 32)
-    second.hear(told)
+    second.merge(told)
     passed_on = look(second, (256.0, 256.0), 0.25)
     assert passed_on.codes.shape == (32, 32)
-    third.hear(passed_on)
+    third.merge(passed_on)
     assert known(third, (160.0, 160.0)) == 0.5
     assert known(third, (256.0, 256.0)) == 0.25
     assert np.isnan(known(third, (340.0, 340.0)))
@@ -98,17 +98,17 @@ def test_news_goes_from_robot_to_robot_and_does_not_grow() -> None:
 def test_what_one_saw_itself_comes_before_what_it_is_told() -> None:
     first, second = RobotMemory(PARAMETERS), RobotMemory(PARAMETERS)
     look(second, (256.0, 256.0), 0.3)
-    second.hear(look(first, (256.0, 256.0), 0.5))
+    second.merge(look(first, (256.0, 256.0), 0.5))
     assert known(second, (256.0, 256.0)) == pytest.approx(0.3)
-    told = second.tell(np.array([256.0, 256.0]))
+    told = second.shared_map(np.array([256.0, 256.0]))
     assert told is not None
     assert importance_of(told.codes).max(initial=0.0, where=told.codes > 0) < 0.4
 
 
 def test_who_does_not_share_tells_nothing_and_hears_nothing() -> None:
     alone = RobotMemory(PerceptionParameters(512, 256, 64, 256.0, 0.0, True))
-    assert alone.tell(np.array([256.0, 256.0])) is None
-    alone.hear(look(RobotMemory(PARAMETERS), (256.0, 256.0), 0.5))
+    assert alone.shared_map(np.array([256.0, 256.0])) is None
+    alone.merge(look(RobotMemory(PARAMETERS), (256.0, 256.0), 0.5))
     assert np.isnan(known(alone, (256.0, 256.0)))
 
 
@@ -120,7 +120,7 @@ def test_who_does_not_share_tells_nothing_and_hears_nothing() -> None:
 def test_whatever_is_told_becomes_a_map(corner: tuple[int, int], data: bytes) -> None:
     memory = RobotMemory(PARAMETERS)
     codes: Codes = np.frombuffer(data, np.uint8).reshape(32, 32)
-    memory.hear(SharedMap(corner, codes))
+    memory.merge(SharedMap(corner, codes))
     local = memory.local_map(np.array([256.0, 256.0]))
     assert not np.isinf(local).any() and (np.isnan(local) | (local >= 0.0)).all()
 

@@ -17,7 +17,7 @@ from edge.core.position import (
 )
 from edge.core.vehicle import Action, Mode, VehicleState
 from edge.drivers.px4.telemetry import Px4Telemetry
-from edge.flight.lift import Lift, Motion, look
+from edge.flight.lift import Lift, Motion, update
 from edge.flight.state import FlightInputs, FlightMemory
 from edge.flight.step import step
 from edge.messages.codes import Reason, ReasonCode
@@ -131,7 +131,7 @@ def test_a_flight_by_its_height_and_thrust(name: str) -> None:
             in_air=vehicle.in_air,
             ground_below_m=4.5,
         )
-        lift = look(lift, motion, now_s, TICK_S)
+        lift = update(lift, motion, now_s, TICK_S)
         assert lift.off_s(now_s) < 0.0
         if lift.stands(now_s):
             stood_m.append(-vehicle.position_local_m[2])

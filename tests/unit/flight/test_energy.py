@@ -27,13 +27,13 @@ def fly(
     """A flight whose battery falls evenly, told twice a second; the share at its end."""
     draw = random.Random(1)
     share = from_share
-    consumption.hear(begin_s, False, share, None)
+    consumption.add(begin_s, False, share, None)
     for i in range(1, round(2.0 * flight_s)):
         share = from_share - sag - 0.5 * i / endurance_s
         told = round(share + draw.uniform(-noise, noise), 2)
         if wrong_every and i % wrong_every == 0:
             told = draw.random()
-        consumption.hear(begin_s + 0.5 * i, True, told, 16.0)
+        consumption.add(begin_s + 0.5 * i, True, told, 16.0)
     return share
 
 
@@ -69,7 +69,7 @@ def test_until_then_what_is_configured_counts_and_a_pack_never_lasts_for_ever() 
 def test_the_next_flight_begins_with_what_the_last_one_took() -> None:
     consumption = Consumption(EnergyParameters(endurance_s=900.0))
     share = fly(consumption, 400.0, 120.0)
-    consumption.hear(121.0, False, share, 16.2)
+    consumption.add(121.0, False, share, 16.2)
     assert consumption.endurance_s == pytest.approx(400.0, rel=0.1)
     # After a quarter of a minute, in which it settles, and a whole one the next is measured.
     fly(consumption, 800.0, 70.0, from_share=share, begin_s=130.0)
@@ -80,17 +80,17 @@ def test_a_pack_that_weakens_in_flight_shows_within_three_minutes() -> None:
     consumption, share = Consumption(EnergyParameters(endurance_s=900.0)), 1.0
     for i in range(1590):
         share -= 0.5 / (1200.0 if i < 1200 else 400.0)
-        consumption.hear(0.5 * i, True, share, None)
+        consumption.add(0.5 * i, True, share, None)
     assert consumption.endurance_s == pytest.approx(400.0, rel=0.1)
 
 
 def test_a_battery_that_falls_silent_is_not_known() -> None:
     consumption = Consumption(EnergyParameters())
-    consumption.hear(0.0, True, 0.8, None)
-    consumption.hear(0.5, True, math.nan, None)
+    consumption.add(0.0, True, 0.8, None)
+    consumption.add(0.5, True, math.nan, None)
     energy = consumption.energy(CRITICAL, None)
     assert energy is not None and energy.lasts_s == pytest.approx((0.8 - CRITICAL) * 900.0)
-    consumption.hear(1.0, True, None, None)
+    consumption.add(1.0, True, None, None)
     assert consumption.energy(CRITICAL, None) is None
 
 
@@ -101,7 +101,7 @@ def test_the_voltage_of_a_cell_counts_where_their_number_is_known(
     consumption = Consumption(EnergyParameters(cells=cells, low_cell_v=3.5))
     # A single dip is not believed.
     for i, voltage_v in enumerate((13.8, 13.8, 9.0, 13.8, 13.8)):
-        consumption.hear(0.5 * i, True, 0.9, voltage_v)
+        consumption.add(0.5 * i, True, 0.9, voltage_v)
     energy = consumption.energy(CRITICAL, 60.0)
     assert energy is not None
     assert energy.cell_v == (None if cell_v is None else pytest.approx(cell_v))

@@ -650,7 +650,7 @@ def test_orders_are_refused_with_the_reason(world: World) -> None:
     world.reads(world.said, "not ready: battery 40 %; GPS: 2-D fix")
     world.failed_checks = ()
     assert world.refuse("start") is RefusalCode.WRONG_STATE
-    world.reads(world.said, "start is taken in hold only, the robot is in preflight")
+    world.reads(world.said, "start is accepted in hold only; the robot is in preflight")
     order = world.new_order("takeoff")
     late = replace(order, expires_at_uptime_s=world.now_s - world.started_s)
     answer = world.give(late)
@@ -2216,7 +2216,7 @@ def test_the_page_for_people_says_where_each_order_is_taken() -> None:
     for kind, rule in ORDERS.items():
         named = {state for state in FlightState if state.name in re.findall(r"\w+", said[kind])}
         any_but = said[kind].startswith("any state")
-        assert set(rule.taken_in) == (set(FlightState) - named if any_but else named), kind
+        assert set(rule.states) == (set(FlightState) - named if any_but else named), kind
 
 
 def test_a_row_does_what_its_fields_say() -> None:
@@ -2240,7 +2240,7 @@ def test_a_row_does_what_its_fields_say() -> None:
     assert (plain.reached, plain.target_m, plain.alone_since_s) == (True, None, None)
     assert not plain.killed
     full = replace(
-        row, alarm=True, land_by="return", left_alone="yes", looks_anew=True,
+        row, alarm=True, land_by="return", unattended="yes", drops_observations=True,
         keeps_target=True, rejoins=True, kills=True,
     )  # fmt: skip
     after = enter(full, "so", t)
@@ -2249,7 +2249,7 @@ def test_a_row_does_what_its_fields_say() -> None:
     assert after.alone_since_s == after.rejoined_at_s == world.now_s
     vehicle = structs.replace(world.heard, mode=Mode.HOLD)
     in_hold = structs.replace(t, inputs=structs.replace(t.inputs, vehicle=vehicle))
-    sometimes = replace(row, left_alone="if in hold")
+    sometimes = replace(row, unattended="if in hold")
     assert enter(sometimes, "so", t).alone_since_s is None
     assert enter(sometimes, "so", in_hold).alone_since_s == world.now_s
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from edge.flight.lift import Lift, Motion, look
+from edge.flight.lift import Lift, Motion, update
 
 TICK_S = 0.1
 HOVERS = Motion(
@@ -18,7 +18,7 @@ def flown(motions: Iterable[Motion], lift: Lift | None = None) -> tuple[Lift, fl
     lift, now_s = lift or Lift(), 100.0
     for motion in motions:
         now_s += TICK_S
-        lift = look(lift, motion, now_s, TICK_S)
+        lift = update(lift, motion, now_s, TICK_S)
     return lift, now_s
 
 
@@ -159,5 +159,5 @@ def test_what_carries_it_is_learned_in_the_air_at_its_height_alone() -> None:
         assert lift.hover_thrust == pytest.approx(0.5)
     # Of a long pause nobody knows more than of half a second.
     lift, now_s = flown(hovering)
-    after = look(lift, pushes, now_s + 60.0, 60.0)
+    after = update(lift, pushes, now_s + 60.0, 60.0)
     assert after.hover_thrust == pytest.approx(0.5 + 0.4 * 0.05)

@@ -527,7 +527,7 @@ def test_limits_that_make_no_sense_are_refused_by_name(
         ("1.17.0", "PX4 1.17.0 (tested: PX4 SITL 1.17.0)"),
         ("1.18.0", "PX4 1.18.0 (not tested: newer than 1.17)"),
         ("2.0.0", "PX4 2.0.0 (not tested: newer than 1.17)"),
-        (None, "PX4 did not tell its version"),
+        (None, "PX4 did not report its version"),
     ],
 )
 def test_a_version_is_told_with_how_far_it_was_tried_and_not_refused(

@@ -116,7 +116,7 @@ MUTATIONS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]
         ("comes_down_above",),
     ),
     "nobody remembers who fell silent": (
-        lambda patch: patch.setattr(safety, "highest_still_m", lambda *_: -math.inf),
+        lambda patch: patch.setattr(safety, "highest_possible_m", lambda *_: -math.inf),
         ("falls_silent",),
     ),
     "no fence": (
@@ -145,7 +145,7 @@ MUTATIONS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]
     ),
     "a landing on who stands there": (
         lambda patch: patch.setattr(
-            state.Tick, "comes_down_m",
+            state.Tick, "landing_place_m",
             property(lambda tick: tick.robot.parameters.landing_point_m),
         ),
         ("landing_point_taken",),

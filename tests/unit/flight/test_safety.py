@@ -424,11 +424,11 @@ def test_nobody_flies_below_where_a_silent_robot_may_have_stopped(
         # The policy wants to be right there.
         wanted = limit_speed(way_m_s - vehicle.position_m[:2], FIELD_LIMITS.max_speed_m_s)
         vehicle.fly(passing(vehicle, np.append(wanted, 0.0), silent=[silent]), AT_REST)
-        stops_m = np.linspace(0.0, min(age_s, SILENCE.flies_on_s), 20)[:, None] * way_m_s
-        distances_m.append(np.hypot(*(stops_m - vehicle.position_m[:2]).T).min())
+        possible_places_m = np.linspace(0.0, min(age_s, SILENCE.flies_on_s), 20)[:, None] * way_m_s
+        distances_m.append(np.hypot(*(possible_places_m - vehicle.position_m[:2]).T).min())
     # It left, whichever way it began, and did not come back.
-    strays_m = 0.5 * way_m_s[0] * SILENCE.flies_on_s
-    assert min(distances_m[120:]) > FIELD_SEPARATION.landed_m + strays_m - 0.3
+    deviation_m = 0.5 * way_m_s[0] * SILENCE.flies_on_s
+    assert min(distances_m[120:]) > FIELD_SEPARATION.landed_m + deviation_m - 0.3
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def fly(policy: LpacPolicy, payload: PayloadType = "float16", ticks: int = 6) ->
             )
         )  # fmt: skip
         robots[-1].frame_id = 0x89ABCDEF
-        robots[-1].clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+        robots[-1].clock.update(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     messages: Messages = []
     for tick in range(ticks):
         now_s = 0.4 * tick

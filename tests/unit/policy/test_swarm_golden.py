@@ -238,7 +238,7 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: L
         for i in range(10)
     ]  # fmt: skip
     for robot in robots:
-        robot.clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+        robot.clock.update(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     geometry = shipped_policy.geometry
     # One exchange more than K L: the first messages only give the robots their neighbours.
     for tick in range(geometry.hops * geometry.layers + 2):

@@ -49,7 +49,7 @@ def make_robot(
         robot_id=robot_id, policy=policy, sensor=world, odometry=world,
         parameters=parameters,
     )  # fmt: skip
-    robot.clock.hear(GROUND, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+    robot.clock.update(GROUND, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     return robot
 
 
