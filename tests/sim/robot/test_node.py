@@ -66,7 +66,7 @@ def test_a_sensor_that_shows_nothing_is_said_once_and_keeps_the_robot_down() -> 
     node._pac.sensor = SimpleNamespace(view=lambda _: None)
     with lines_said() as lines:
         field.run(5.0)
-    (line,) = (line for line in lines if "is not used" in line["event"])
+    (line,) = (line for line in lines if "result not used" in line["event"])
     assert line["why"] == "sensor: it shows nothing"
     (check,) = field.robots[0].said.failed_checks
     assert check.code is CheckCode.NO_FRESH_ANSWER and line["why"] in check.text

@@ -305,7 +305,7 @@ def test_who_comes_back_has_forgotten_what_it_saw(shipped_bundle: Bundle) -> Non
 
 
 def test_what_it_does_not_fly_is_named(shipped_bundle: Bundle) -> None:
-    with pytest.raises(ValueError, match="controller = 'clairvoyant-cvt': in batches"):
+    with pytest.raises(ValueError, match="'clairvoyant-cvt': must be 'lpac' in batches"):
         fly_batch([Scenario(controller="clairvoyant-cvt")], shipped_bundle)
     manifest = dataclasses.replace(shipped_bundle.manifest, payload_limit=1e-3)
     narrow = dataclasses.replace(shipped_bundle, manifest=manifest)

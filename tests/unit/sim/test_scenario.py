@@ -58,7 +58,7 @@ def test_whole_robots_fly_as_they_do_in_the_field(scenario: Scenario, named: str
         ("point", Scenario(wind_m_s=3.0), "wind_m_s = 3.0: must be left out for points"),
         ("simulated", Scenario(fault="landed", robots=1), "robots = 1: must be at least 2"),
         ("point", Scenario(fault="landed"), "fault = landed: must be '' for points"),
-        ("simulated", Scenario(fault="nothing"), "fault = nothing: there is none"),
+        ("simulated", Scenario(fault="nothing"), "fault = nothing: no such fault"),
         ("mavlink", Scenario(fault="radio-dies"), "fault = radio-dies: is not flown with mavlink"),
         ("nonsense", Scenario(), "engine = 'nonsense': allowed are 'point', 'simulated'"),
         ("px4", Scenario(), "engine = 'px4': needs PX4's build folder"),
