@@ -30,15 +30,15 @@ def hovers_alone(t: Tick) -> str | None:
     if t.flight.alone_since_s is None:
         return None
     limit_s = t.robot.parameters.hover_land_s
-    return f"hovers, and lands {limit_s:g} s after it began to, if nobody orders or holds it"
+    return f"hovers unattended: lands {limit_s:g} s after it began, unless ordered or held"
 
 
 def remote_control_lost(t: Tick) -> str | None:
     if t.robot.on_remote_control_lost is None or t.inputs.vehicle.remote_control or t.silent:
         return None
-    # A program started in flight has not heard it yet.
-    heard_at_s = t.flight.remote_control_at_s
-    lost_s = t.inputs.now_s - (heard_at_s if heard_at_s > -math.inf else t.flight.since_s)
+    # A program started in flight has not received it yet.
+    received_at_s = t.flight.remote_control_at_s
+    lost_s = t.inputs.now_s - (received_at_s if received_at_s > -math.inf else t.flight.since_s)
     return reason_if(lost_s > _REMOTE_CONTROL_LOST_S, "remote control lost")
 
 
@@ -86,7 +86,9 @@ def lands_beside(t: Tick) -> str | None:
     if beside_m is None or where_it_is or flight.state is FlightState.PILOT:
         return None
     away_m = math.dist(beside_m, t.robot.parameters.landing_point_m)
-    return f"somebody stands or fell silent at its landing point: lands {away_m:.0f} m beside it"
+    return (
+        f"another robot stands or fell silent at its landing point: lands {away_m:.0f} m beside it"
+    )
 
 
 def battery_low(t: Tick) -> str | None:

@@ -73,7 +73,7 @@ _REMOTE_CONTROL = {
     8: "a ground station's sticks count (the second before the first), or the remote control's "
     "while they are silent",
 }
-_HEIGHT = {0: "barometer", 1: "GPS", 2: "range to what is below", 3: "vision"}
+_HEIGHT = {0: "barometer", 1: "GPS", 2: "rangefinder", 3: "vision"}
 _MOTOR_FAILURE = {0: "warn", 1: "hold", 2: _LAND, 3: _RETURN, 4: _STOP_MOTORS}
 _PROPELLER = {-1: "do nothing", 0: "warn", 1: _RETURN, 2: _LAND}
 _TRAFFIC = {0: "do nothing", 1: "warn", 2: _RETURN, 3: _LAND, 4: "hold"}

@@ -91,8 +91,8 @@ def _link_lost(t: Tick) -> str | None:
 def _disarmed_again(t: Tick) -> str | None:
     vehicle, flight = t.inputs.vehicle, t.flight
     # Only a position shows whether the autopilot was rebooted.
-    heard = min(vehicle.heartbeat_at_s, vehicle.position_at_s) > flight.since_s
-    return _disarmed(t) if heard and not vehicle.fell and not flight.killed else None
+    received = min(vehicle.heartbeat_at_s, vehicle.position_at_s) > flight.since_s
+    return _disarmed(t) if received and not vehicle.fell and not flight.killed else None
 
 
 def _armed_before(t: Tick) -> str | None:
@@ -346,7 +346,7 @@ TRANSITIONS: tuple[Transition, ...] = (
                "the operator orders disarm, on the ground", _always("disarm ordered"),
                order="disarm", actions=(Action.DISARM,)),
     Transition((*AIRBORNE, _S.PILOT, _S.FAULT), _S.FAULT, _R.DISARMED_IN_AIR,
-               "the vehicle is disarmed in the air, or its autopilot starts anew there", _fell,
+               "the vehicle is disarmed in the air, or its autopilot reboots there", _fell,
                alarm=True),
     Transition((*AIRBORNE, _S.PILOT), _S.LANDED, _R.DISARMED, "the vehicle is disarmed", _disarmed),
     Transition((_S.FAULT,), _S.INIT, _R.DISARMED,
@@ -448,7 +448,7 @@ TRANSITIONS: tuple[Transition, ...] = (
                "offboard or arming is refused, or takes too long", _arming_failed,
                actions=(Action.DISARM,), alarm=True),
     Transition((_S.TAKEOFF,), _S.HOLD, _R.AT_HEIGHT,
-               "at its height, and the autopilot says in the air", _at_slot, keeps_target=True),
+               "at its height, and the autopilot reports in the air", _at_slot, keeps_target=True),
     Transition((_S.TAKEOFF,), _S.LAND, _R.NOT_CLIMBING, "it does not climb", _lift_off_failed,
                alarm=True),
     Transition((_S.HOLD,), _S.MISSION, _R.MISSION_STARTED, "the operator orders start",

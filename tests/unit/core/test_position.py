@@ -72,7 +72,7 @@ WITHOUT: list[tuple[dict[str, Any], PositionCause, str]] = [
     (
         {"estimator": EstimatorStatus(False, False, 1e9)},
         PositionCause.NOT_ESTIMATED,
-        "the autopilot's estimator does not vouch for it",
+        "the autopilot's estimator does not consider it valid",
     ),
     (
         {"gps": dataclasses.replace(GPS, offset_m=7.0)},
@@ -87,7 +87,7 @@ WITHOUT: list[tuple[dict[str, Any], PositionCause, str]] = [
     (
         {"gps": dataclasses.replace(GPS, slip_m=5.1)},
         PositionCause.SLIPS,
-        "the GPS place moved by 5.1 m in another way than its velocity",
+        "the GPS place moved by 5.1 m, contrary to its velocity",
     ),
     ({"position_local_m": None}, PositionCause.UNKNOWN, "it is not known"),
     ({"origin": None}, PositionCause.UNKNOWN, "it is not known"),

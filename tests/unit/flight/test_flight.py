@@ -1855,7 +1855,7 @@ def test_after_a_lapse_that_nobody_answers_it_lands(world: World) -> None:
     world.order = None
     assert world.flight.alarming
     (alone,) = (a for a in world.tick().alarms if a.code is ReasonCode.HOVERS_ALONE)
-    world.reads(alone, "hovers, and lands 60 s after it began to, if nobody orders or holds it")
+    world.reads(alone, "hovers unattended: lands 60 s after it began, unless ordered or held")
     world.until(FlightState.LAND, 35.0)
     assert world.now_s - began_s == pytest.approx(60.0, abs=1.0)
     assert world.flight.reason.code is ReasonCode.NOBODY_ANSWERED
