@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from edge.drivers.flight_log import ROBOT_TOPICS, FlightLog
+from edge.drivers.log_reader import read, read_metadata
 from edge.flight.record import TickReader, TickWriter
 from edge.messages.mission import FlightState
-from lpac.analysis.log_reader import read, read_metadata
 from lpac.ground.procedure import Until
 from lpac.ground.station.protocol import (
     Enable,

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F64
-from lpac.analysis.log_reader import FlightLogError, LogGap, read
+from edge.drivers.log_reader import FlightLogError, LogGap, read
 
 _NOT_FINITE = frozenset({"NaN", "Infinity", "-Infinity"})
 

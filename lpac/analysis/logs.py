@@ -25,6 +25,7 @@ from edge.core.counted import counted
 from edge.core.fence import Fence
 from edge.core.schema import explain
 from edge.drivers.flight_log import FlightMetadata
+from edge.drivers.log_reader import FlightLogError, LogGap, read, read_metadata
 from edge.messages.codes import Reason, Refusal
 from edge.messages.mission import FlightState, LoopStatus, Origin, RobotStatus
 from lpac.analysis.field_truth import (
@@ -35,7 +36,6 @@ from lpac.analysis.field_truth import (
     read_places,
     track_of,
 )
-from lpac.analysis.log_reader import FlightLogError, LogGap, read, read_metadata
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.truth import TRUTH, TrueTrack, load_truth
 

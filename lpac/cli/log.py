@@ -23,7 +23,7 @@ def trials(
 
     In JSON: file -> trial -> [first, last] Unix time, s; the time without a trial is under "".
     """
-    from lpac.analysis.log_reader import FlightLogError
+    from edge.drivers.log_reader import FlightLogError
 
     uptimes: dict[Path, _Uptimes] = {}
     began_s: dict[tuple[str, str], float] = {}
@@ -54,7 +54,7 @@ def _uptimes(path: Path, began_s: dict[tuple[str, str], float]) -> _Uptimes:
     Uptime never jumps, unlike the robots' clocks. `began_s` gets each program's start by the last
     state of its clock.
     """
-    from lpac.analysis.log_reader import read
+    from edge.drivers.log_reader import read
 
     times: _Uptimes = {}
     for _, time_s, status in read(path, "status", on_gap=_say):
@@ -76,7 +76,7 @@ def repair(
     out: Annotated[Path, typer.Argument(help="The new file to write.")],
 ) -> None:
     """Copy the readable parts of a damaged log, and list the gaps."""
-    from lpac.analysis.log_reader import repair
+    from edge.drivers.log_reader import repair
 
     count = repair(log, out, _say)
     typer.echo(f"{out}: {count:,} messages")

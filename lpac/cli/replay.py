@@ -14,9 +14,9 @@ from lpac.cli.printing import working
 
 if TYPE_CHECKING:
     from edge.drivers.flight_log import FlightMetadata
+    from edge.drivers.log_reader import LogGap
     from edge.policy.bundle import Bundle
     from lpac.analysis.flight_replay import FlightReplay
-    from lpac.analysis.log_reader import LogGap
     from lpac.analysis.policy_replay import Comparison
 
 app = new_app()
@@ -72,7 +72,7 @@ def replay(
 
 
 def _run_again(logs: list[Path], bundle: Path | None) -> _RunAgain:
-    from lpac.analysis.log_reader import LogGap
+    from edge.drivers.log_reader import LogGap
 
     metadata = _metadata(logs)
     missing = list[LogGap]()
@@ -119,7 +119,7 @@ def _problems(of: _RunAgain) -> list[str]:
 
 def _metadata(logs: Iterable[Path]) -> "dict[Path, FlightMetadata]":
     """Metadata by segment. In a folder, files that are no flight logs are skipped."""
-    from lpac.analysis.log_reader import FlightLogError, read_metadata
+    from edge.drivers.log_reader import FlightLogError, read_metadata
 
     metadata = {}
     for path in _segments(logs):
@@ -139,9 +139,9 @@ def _policy(
     """The bundle, and comparisons of all its ticks with the log."""
     from itertools import chain
 
+    from edge.drivers.log_reader import read
     from edge.policy.bundle import BundleError, load_bundle
     from edge.policy.lpac.policy import LpacPolicy
-    from lpac.analysis.log_reader import read
     from lpac.analysis.policy_replay import replay as run_again
 
     bundle_path = given or Path(next(iter(metadata.values())).bundle_path)
@@ -167,7 +167,7 @@ def _policy(
 
 
 def _has_policy_ticks(paths: Iterable[Path]) -> bool:
-    from lpac.analysis.log_reader import read
+    from edge.drivers.log_reader import read
 
     return any(True for path in paths for _ in read(path, "policy", on_gap=_told_already))
 
@@ -180,9 +180,9 @@ def _flights(
     metadata: "Mapping[Path, FlightMetadata]", missing: "list[LogGap]"
 ) -> "dict[Path, FlightReplay]":
     """Recompute the programs' flight decisions. A program's segments must be in order."""
+    from edge.drivers.log_reader import read
     from edge.flight.record import TickError, TickReader
     from lpac.analysis.flight_replay import FlightReplay
-    from lpac.analysis.log_reader import read
 
     readers: dict[FlightMetadata, TickReader] = {}
     flights = {}

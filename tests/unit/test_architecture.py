@@ -100,7 +100,7 @@ ONLY_IN = {
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},
     "cyclonedds": {"lpac/middleware/over_cyclone.py"},
-    "mcap": {"edge/drivers/", "lpac/analysis/log_reader.py"},
+    "mcap": {"edge/drivers/"},
     # Elsewhere it is `edge.core.logger`, which loads it without rich.
     "structlog": {"edge/core/logger.py", "edge/drivers/logs.py"},
     "pymavlink": {"lpac/sim/"},

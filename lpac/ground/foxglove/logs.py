@@ -5,7 +5,7 @@ from pathlib import Path
 
 from foxglove import Context, open_mcap
 
-from lpac.analysis.log_reader import read
+from edge.drivers.log_reader import read
 from lpac.ground.foxglove.channels import Channels
 from lpac.ground.foxglove.view import FoxgloveView
 

@@ -12,8 +12,8 @@ import numpy as np
 from edge.core import F32
 from edge.core.part import PartError
 from edge.core.wire import Rejection, decode
+from edge.drivers.log_reader import read, read_metadata
 from edge.policy.family import Observation, Perceived, Policy, PolicyStep
-from lpac.analysis.log_reader import read, read_metadata
 
 
 class RecordingError(ValueError):

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from edge.drivers.log_reader import read as read_log
 from edge.messages.mission import FlightState
 from edge.policy.lpac.policy import LpacPolicy
-from lpac.analysis.log_reader import read as read_log
 from lpac.analysis.policy_replay import replay
 from lpac.ground.station.protocol import SafetyCommand, Start
 from tests.conftest import ROOT, SHIPPED

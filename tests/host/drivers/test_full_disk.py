@@ -13,8 +13,8 @@ import pytest
 
 from edge.drivers.flight_log import FlightLog, FlightMetadata
 from edge.drivers.identity_folder import load_identity
+from edge.drivers.log_reader import LogGap, read
 from edge.identity.members import Role
-from lpac.analysis.log_reader import LogGap, read
 from lpac.fleet.authority import create_authority, new_member
 from tests.needs import missing
 from tests.said import lines_said

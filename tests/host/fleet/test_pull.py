@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from edge.drivers.flight_log import FlightLog, FlightMetadata
-from lpac.analysis.log_reader import read
+from edge.drivers.log_reader import read
 from lpac.fleet.pull import Pulled, pull
 from lpac.fleet.session import FleetError
 from lpac.fleet.settings import load_fleet

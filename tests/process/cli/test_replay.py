@@ -11,11 +11,11 @@ import pytest
 from msgspec import structs
 
 from edge.drivers.flight_log import FlightLog, FlightMetadata
+from edge.drivers.log_reader import read
 from edge.flight.record import FlightTick, TickReader, TickWriter
 from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
 from edge.policy.lpac.policy import LpacPolicy
-from lpac.analysis.log_reader import read
 from tests.command import called, error_line, lpac
 from tests.conftest import SHIPPED
 from tests.record_flights import RECORDED

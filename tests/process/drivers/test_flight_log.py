@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lpac.analysis.log_reader import read
+from edge.drivers.log_reader import read
 from tests.conftest import ROOT
 from tests.unit.drivers.test_flight_log import NOW, flight_log, logged
 

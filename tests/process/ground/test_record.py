@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from edge.core.world import parse_world, rasterize
+from edge.drivers.log_reader import FlightLogError, read, read_metadata
 from edge.messages.mission import FlightState
-from lpac.analysis.log_reader import FlightLogError, read, read_metadata
 from lpac.analysis.voronoi import coverage_cost
 from lpac.ground.station.client import command
 from lpac.ground.station.protocol import (

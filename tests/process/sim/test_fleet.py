@@ -18,9 +18,9 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import pytest
 
+from edge.drivers.log_reader import read, read_metadata
 from edge.messages.mission import FlightState
 from edge.robot.config import load_config
-from lpac.analysis.log_reader import read, read_metadata
 from lpac.fleet.settings import load_fleet
 from lpac.ground.station.config import load_ground
 from lpac.sim.description import ERRORS

@@ -15,6 +15,7 @@ import pytest
 
 from edge.core import F64
 from edge.core.part import PartError
+from edge.drivers.log_reader import read
 from edge.flight.failsafe import required
 from edge.identity.guard import Unguarded
 from edge.messages.codes import CheckCode, ReasonCode
@@ -25,7 +26,6 @@ from edge.robot.readiness import Checks
 from lpac.analysis.examination import Examined, Wanted, examine
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.flight_replay import FlightReplay
-from lpac.analysis.log_reader import read
 from lpac.analysis.policy_replay import replay
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from lpac.ground.procedure import Procedure, Until

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edge.drivers.flight_log import FlightLog, topic
+from edge.drivers.log_reader import FlightLogError
 from lpac.analysis.arrays import Columns, log_arrays
-from lpac.analysis.log_reader import FlightLogError
 
 
 @dataclass(frozen=True)

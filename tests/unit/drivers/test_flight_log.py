@@ -22,8 +22,8 @@ from msgspec import structs
 from edge.core.fence import Fence
 from edge.core.vehicle import Action, ActionResult, GlobalOrigin, VehicleState, Velocity
 from edge.drivers.flight_log import FlightLog, FlightMetadata, topic
+from edge.drivers.log_reader import FlightLogError, LogGap, read, read_metadata, repair
 from edge.messages.mission import FlightState, GroundState, Order, OrderResult, Origin, Place
-from lpac.analysis.log_reader import FlightLogError, LogGap, read, read_metadata, repair
 
 METADATA = FlightMetadata(3, 77, "ab" * 32, "policies/x", '{"robot": {"id": 3}}', "0.1.0")
 NOW = 1.7e9

@@ -14,13 +14,13 @@ import pytest
 from msgspec import structs
 
 from edge.core.changes import changed, changes, same
+from edge.drivers.log_reader import read
 from edge.flight import guidance, orders, safety, state, step
 from edge.flight.record import FlightTick, TickError, TickReader, TickWriter
 from edge.flight.transitions import TRANSITIONS, Rows, by_state
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
 from lpac.analysis.flight_replay import FlightReplay, differing
-from lpac.analysis.log_reader import read
 from tests.record_flights import FLIGHTS, RECORDED
 
 _S = FlightState
