@@ -160,7 +160,7 @@ def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: FrailHosts) -> 
     waits: list[str] = []
 
     def report(step: str, _: float | None) -> None:
-        if step.startswith("waits"):
+        if step.startswith("wait: "):
             waits.append(step)
             enrolled[0].heal()
 
