@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from edge.core.wire import deflate, inflate
 from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.envelope import enclose, read_envelope
 from edge.messages.codec import decode, encode
@@ -155,10 +154,10 @@ class _ChangedLink:
         if topic is STATUS and change is not None:
             envelope = read_envelope(data)
             assert envelope is not None
-            payload = inflate(envelope.payload, topic.limit_bytes)
+            payload = topic.unpacked(envelope.payload)
             assert payload is not None
-            status = change(decode(RobotStatus, bytes(payload)))
-            data = enclose(deflate(encode(status)), envelope.head.number)
+            status = change(decode(RobotStatus, payload))
+            data = enclose(topic.packed(encode(status)), envelope.head.number)
         self._link.publish(topic, data)
 
 

@@ -92,17 +92,10 @@ def encode(
         data += _MAP.pack(message.trial, x, y, len(codes)) + codes.tobytes()
     if len(data) >= _LEAST_BYTES:
         stored = payload_size if as_in_flight else 0
-        smaller = _deflated(data[:stored], data[stored:])
+        smaller = deflate(data[stored:], after=data[:stored])
         if len(smaller) < len(data):
             kind, data = kind | _COMPRESSED, smaller
     return bytes((kind,)) + data
-
-
-def _deflated(stored: bytes, compressed: bytes) -> bytes:
-    """One raw deflate stream of both, the first part stored uncompressed."""
-    store, deflate = (zlib.compressobj(level, wbits=-zlib.MAX_WBITS) for level in (0, _LEVEL))
-    head = store.compress(stored) + store.flush(zlib.Z_SYNC_FLUSH) if stored else b""
-    return head + deflate.compress(compressed) + deflate.flush()
 
 
 def rounded(payload: F32, payload_type: PayloadType) -> F32:
@@ -219,9 +212,13 @@ def _size(length: int, payload_type: PayloadType, shared_side: int) -> int:
     return size + length * _FLOATS[payload_type].itemsize
 
 
-def deflate(data: bytes) -> bytes:
-    """Compress data to one raw deflate stream (RFC 1951)."""
-    return zlib.compress(data, _LEVEL, -zlib.MAX_WBITS)
+def deflate(data: bytes, *, after: bytes = b"") -> bytes:
+    """Compress data to one raw deflate stream (RFC 1951), in which `after` is stored before it."""
+    head = b""
+    if after:
+        store = zlib.compressobj(0, wbits=-zlib.MAX_WBITS)
+        head = store.compress(after) + store.flush(zlib.Z_SYNC_FLUSH)
+    return head + zlib.compress(data, _LEVEL, -zlib.MAX_WBITS)
 
 
 def inflate(data: bytes | memoryview, size: int) -> memoryview | None:

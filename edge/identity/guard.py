@@ -15,7 +15,6 @@ from threading import Lock
 from msgspec import Struct
 
 from edge.core.logger import log
-from edge.core.wire import deflate, inflate
 from edge.identity.envelope import (
     NO_MEMBERS,
     RELEASE,
@@ -202,17 +201,14 @@ class Guard(ABC):
             # Its signature cannot be verified here: the robot may not have sent it.
             with self._lock:
                 self._unreadable_robots.add(robot_id)
-        if not isinstance(found, RefusedMessage) and topic.deflated:
-            payload = inflate(found[0], topic.limit_bytes)
-            found = (
-                RefusedMessage.COMPRESSION
-                if payload is None or len(payload) > topic.limit_bytes
-                else (bytes(payload), found[1])
-            )
         if isinstance(found, RefusedMessage):
             self._refuse(found, key)
             return False
-        handler(key, found[0], found[1])
+        payload = topic.unpacked(found[0])
+        if payload is None:
+            self._refuse(RefusedMessage.COMPRESSION, key)
+            return False
+        handler(key, payload, found[1])
         return True
 
     def _refuse(self, reason: RefusedMessage, key: str) -> None:
@@ -242,7 +238,7 @@ class Unguarded(Guard):
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """See `Guard`."""
         number = MessageNumber(self._start, self._next_sequence(topic.pattern))
-        return enclose(_packed(topic, payload), number, release=self.release)
+        return enclose(topic.packed(payload), number, release=self.release)
 
     def _authenticate(
         self, topic: Topic, key: str, envelope: Envelope
@@ -373,7 +369,7 @@ class SignedGuard(Guard):
 
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """See `Guard`."""
-        return self._seal(_key(self._own, topic), _packed(topic, payload))
+        return self._seal(_key(self._own, topic), topic.packed(payload))
 
     def _seal(self, key: str, payload: bytes) -> bytes:
         return seal(
@@ -451,10 +447,6 @@ class _SealingLink:
     def refused(self) -> int:
         """See `Link`."""
         return self._link.refused()
-
-
-def _packed(topic: Topic, payload: bytes) -> bytes:
-    return deflate(payload) if topic.deflated else payload
 
 
 def _knock_key(sender: Member, place: str) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import Literal, NamedTuple, Protocol
 
-from edge.core.wire import MAX_ROBOT_ID
+from edge.core.wire import MAX_ROBOT_ID, deflate, inflate
 
 _ROBOT_KEY = re.compile(r"robot/(0|[1-9][0-9]{0,4})/")
 
@@ -41,6 +41,17 @@ class Topic(NamedTuple):
     def pattern(self) -> str:
         """Key expression of all its senders, below `lpac/<fleet>/`."""
         return f"robot/*/{self.name}" if self.sender == "robot" else f"ground/{self.name}"
+
+    def packed(self, payload: bytes) -> bytes:
+        """The payload as it travels."""
+        return deflate(payload) if self.deflated else payload
+
+    def unpacked(self, data: bytes) -> bytes | None:
+        """The inverse of `packed`; None for other data, or for more than `limit_bytes`."""
+        if not self.deflated:
+            return data
+        payload = inflate(data, self.limit_bytes)
+        return None if payload is None or len(payload) > self.limit_bytes else bytes(payload)
 
 
 # `most_hz` leaves room for a policy faster than the paper's, and for orders to all robots at once.

@@ -225,12 +225,10 @@ class Election:
 
     def _own_name_age_s(self) -> float:
         """Median time since robots heard a station of this name, s; infinite if most did not."""
-        lasts = map(self._robots.last, self._robots.statuses())
+        own = self._setup.operator
         ages_s = [
-            status.ground_age_s + age_s
-            if status.operator == self._setup.operator and status.ground_age_s is not None
-            else math.inf
-            for status, age_s in filter(None, lasts)
+            self._robots.ground_age_s(robot) if status.operator == own else math.inf
+            for robot, status in self._robots.statuses().items()
         ]
         return statistics.median_high(ages_s) if ages_s else math.inf
 

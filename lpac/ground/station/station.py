@@ -320,11 +320,8 @@ class Station:
 
     def is_heard_late(self) -> bool:
         """Whether a robot seems to miss states, which then go out at each tick."""
-        lasts = filter(None, map(self._robots.last, self._robots.statuses()))
-        return any(
-            status.ground_age_s is not None and _LATE_S < status.ground_age_s + age_s < _LOST_S
-            for status, age_s in lasts
-        )
+        ages_s = map(self._robots.ground_age_s, self._robots.statuses())
+        return any(_LATE_S < age_s < _LOST_S for age_s in ages_s)
 
     def published_world(self) -> str | None:
         """World file to publish, while a robot needs it."""

@@ -3,6 +3,7 @@
 Pure: the owner sets the time. A program is known by its robot's id and its boot nonce.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -188,6 +189,13 @@ class RobotStatuses:
         return (
             None if program is None else (program.newest.status, self.now_s - program.newest.at_s)
         )
+
+    def ground_age_s(self, robot_id: int) -> float:
+        """Age of the newest ground state that the robot is known to have, s; infinite if none."""
+        last = self.last(robot_id)
+        if last is None or last[0].ground_age_s is None:
+            return math.inf
+        return last[0].ground_age_s + last[1]
 
     def others(self, robot_id: int) -> list[tuple[RobotStatus, float]]:
         """Fresh statuses, with their ages, s, of further programs with this robot's id."""

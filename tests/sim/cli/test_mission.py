@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from edge.core.wire import inflate
 from edge.identity.envelope import HEAD_BYTES
 from edge.messages.codec import decode
 from edge.messages.mission import FlightState, Order
@@ -129,9 +128,9 @@ class Commanded:
         hear = link._subscriptions[ORDER]
 
         def hear_order(key: str, data: bytes) -> None:
-            payload = inflate(data[HEAD_BYTES:], ORDER.limit_bytes)
+            payload = ORDER.unpacked(data[HEAD_BYTES:])
             assert payload is not None
-            order = decode(Order, bytes(payload))
+            order = decode(Order, payload)
             if order.robot_id != robot.robot_id or heard(order):
                 hear(key, data)
 

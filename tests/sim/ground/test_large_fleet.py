@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from edge.core.wire import inflate
 from edge.identity.envelope import HEAD_BYTES
 from edge.identity.guard import Unguarded
 from edge.messages.codec import decode, encode
@@ -32,9 +31,9 @@ class Ground:
 
     def publish(self, topic: Topic, data: bytes) -> None:
         if topic == STATE:
-            payload = inflate(data[HEAD_BYTES:], topic.limit_bytes)
+            payload = topic.unpacked(data[HEAD_BYTES:])
             assert payload is not None
-            self.said.append((self.now_s, decode(GroundState, bytes(payload))))
+            self.said.append((self.now_s, decode(GroundState, payload)))
 
     def is_claimed(self, _: int) -> bool:
         return False
@@ -55,7 +54,9 @@ class Ground:
         pass
 
 
-def flown(robots: int, duration_s: float) -> tuple[Ground, GroundNode]:
+def flown(
+    robots: int, duration_s: float, *, ground_age_s: float | None = None
+) -> tuple[Ground, GroundNode]:
     """A ground that commands, and hears of each robot twice a second, of all at their own times."""
     ground = Ground()
     node, robot_guard = GroundNode(setup(robots), ground, ground, Unguarded(1)), Unguarded(1)
@@ -68,7 +69,9 @@ def flown(robots: int, duration_s: float) -> tuple[Ground, GroundNode]:
             for robot in range(robots):
                 # Ten moments in a second, of which each robot has two.
                 if (2 * tick + late - robot) % 5 == 0:
-                    said = status(robot, uptime_s=ground.now_s, sequence=tick)
+                    said = status(
+                        robot, uptime_s=ground.now_s, sequence=tick, ground_age_s=ground_age_s
+                    )
                     hear(f"robot/{robot}/status", robot_guard.seal(STATUS, encode(said)))
         ground.now_s = TICK_S * (tick + 1)
         node.tick()
@@ -79,6 +82,16 @@ def flown(robots: int, duration_s: float) -> tuple[Ground, GroundNode]:
 def test_states_are_said_as_often_as_the_table_of_topics_says(robots: int) -> None:
     ground, _ = flown(robots, 10.0)
     assert len(ground.said) / 10.0 == pytest.approx(STATE.rate_hz, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("ground_age_s", "states_hz"), [(0.4, STATE.rate_hz), (1.2, 1.0 / TICK_S), (9.0, STATE.rate_hz)]
+)
+def test_states_are_said_at_each_tick_while_a_robot_hears_them_late(
+    ground_age_s: float, states_hz: float
+) -> None:
+    ground, _ = flown(10, 10.0, ground_age_s=ground_age_s)
+    assert len(ground.said) / 10.0 == pytest.approx(states_hz, rel=0.1)
 
 
 @pytest.mark.parametrize("robots", [32, 100])

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.core.wire import deflate
 from edge.identity.envelope import OVERHEAD_BYTES
 from edge.identity.guard import Membership, Sender, SignedGuard, Unguarded
 from edge.identity.members import Member as Listed
@@ -314,6 +315,29 @@ def test_without_a_guard_a_message_is_its_keys() -> None:
     for data in (b"m", robot(3).guard.seal(MESSAGE, b"m")):
         assert not topics[MESSAGE]("robot/3/message", data)
     assert len(received) == 2 and guard.refused() == {"no_envelope": 2}
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b"land",
+        b"",
+        deflate(b"land")[:-1],
+        deflate(b"land") + b"!",
+        deflate(bytes(STATE.limit_bytes + 1)),
+        deflate(bytes(10**8)),
+    ],
+    ids=["plain", "nothing", "cut off", "and more", "a byte too long", "a bomb"],
+)
+def test_what_does_not_inflate_within_its_limit_is_refused(one: Member, bad: bytes) -> None:
+    undeflated = STATE._replace(deflated=False)
+    open_fleet = Unguarded(5)
+    receive = open_fleet.subscriptions({STATE: lambda *_: pytest.fail("it was received")})[STATE]
+    assert not one.accepts(STATE, "ground/state", operator().guard.seal(undeflated, bad))
+    assert not receive("ground/state", open_fleet.seal(undeflated, bad))
+    assert one.guard.refused() == open_fleet.refused() == {"compression": 1}
+    largest = bytes(STATE.limit_bytes)
+    assert one.accepts(STATE, "ground/state", operator(2).guard.seal(STATE, largest))
 
 
 def test_the_link_itself_is_asked_for_the_rest(one: Member) -> None:
