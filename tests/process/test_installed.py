@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from threading import Timer
 
 import pytest
 
@@ -113,7 +114,7 @@ def test_a_fleet_is_commanded_seen_and_recorded(lpac: Path, folder: Path) -> Non
                         "--no-script", "--out", "fleet"))  # fmt: skip
         fleet = ("--fleet", "fleet/fleet.toml")
         started(program(lpac, folder, "ground station ann", "ground", "--name", "ann", *fleet))
-        started(program(lpac, folder, "hears the ground", "record", "--out", "logs", *fleet))
+        started(program(lpac, folder, "connected to the ground", "record", "--out", "logs", *fleet))
         started(program(lpac, folder, "only observes", "map", "--port", "0", *fleet))
         until_s = time.monotonic() + PATIENCE_S
         seen = ""
@@ -134,7 +135,11 @@ def program(lpac: Path, folder: Path, says: str, *arguments: str) -> Iterator[No
     ) as running:  # fmt: skip
         try:
             assert running.stdout is not None
-            assert any(says in line for line in running.stdout)
+            silent = Timer(PATIENCE_S, running.kill)
+            silent.start()
+            has_said = any(says in line for line in running.stdout)
+            silent.cancel()
+            assert has_said, says
             yield
         finally:
             running.send_signal(signal.SIGINT)
