@@ -199,7 +199,7 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
         assert made.vehicle_is(lambda v: not v.armed)
     told = [m["message"] for path in (tmp_path / "logs").glob("*.mcap")
             for _, _, m in read_log(path, "/log")]  # fmt: skip
-    assert any("taken up" in text and world_id(WORLD) in text for text in told)
+    assert any("adopted from the ground" in text and world_id(WORLD) in text for text in told)
 
 
 def tells_where_it_stands(made: Rig) -> None:
