@@ -1,4 +1,4 @@
-"""`lpac fleet`: everything about the robots' computers, for all robots at once."""
+"""`lpac fleet`: manage the robots' computers, all at once."""
 
 from collections.abc import Callable
 

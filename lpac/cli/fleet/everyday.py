@@ -1,4 +1,4 @@
-"""`lpac fleet`: the everyday commands, for all robots at once."""
+"""`lpac fleet`: deploy, start and stop programs, land, and read journals."""
 
 import json
 import shlex
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 import typer
 
 from lpac.cli.fields import options_of
-from lpac.cli.fleet.progress import print_json, require_all, run_all, run_for_each, tell
+from lpac.cli.fleet.progress import print_json, print_results, require_all, run_all, run_for_each
 from lpac.cli.fleet.status import SHORT, flight, program
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots, open_fleet
 from lpac.cli.printing import GOOD, styled, working
@@ -31,12 +31,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 InFlight = Annotated[
-    bool, typer.Option("--in-flight", help="Also if the vehicle is armed: it holds or lands then.")
+    bool, typer.Option("--in-flight", help="Even if the vehicle is armed: it holds or lands.")
 ]
 _COLOURS = ("cyan", "magenta", "yellow", "green", "blue", "bright_cyan", "bright_magenta")
-
-
-# Releases
 
 
 class _Deployed(NamedTuple):
@@ -47,9 +44,9 @@ class _Deployed(NamedTuple):
 
 
 def deploy(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
-    """Bring image, policy and configuration to the robots, prove them there, and run them.
+    """Copy image, policy and configuration to the robots, verify them there, and run them.
 
-    A robot on which anything is wrong keeps what it had. A robot in flight refuses.
+    If anything fails on a robot, it keeps its release. A robot in flight refuses.
     """
     from lpac.fleet.deploy import deploy as deploy_to
     from lpac.fleet.release import load_common, make_release
@@ -70,7 +67,7 @@ def deploy(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson 
             return _Deployed(deployed, time.monotonic() - began_s)
 
         outcomes = run_for_each(chosen, one)
-    tell(
+    print_results(
         config, outcomes, "deployed on", as_json=as_json, cells=_deployed_cells,
         numbers=("MB sent", "perceive ms", "infer ms", "s"), headings=("release",),
         describe=lambda v: {**v.deployed._asdict(), "duration_s": v.duration_s},
@@ -90,24 +87,21 @@ def _deployed_cells(value: _Deployed) -> tuple["str | Text", ...]:
 
 
 def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
-    """Go back to the release before the present one. A robot in flight refuses."""
+    """Return to the previous release. A robot in flight refuses."""
     from lpac.fleet.deploy import rollback as roll_back
 
     config, chosen = open_fleet(fleet, robots)
     chosen = _without_spares(config, chosen, "rolled back")
 
-    tell(
+    print_results(
         config, run_for_each(chosen, partial(roll_back, config)), "rolled back on", as_json=as_json,
         headings=("release",), cells=lambda release: (release, styled("rolled back", GOOD)),
         describe=lambda release: {"release": release},
     )  # fmt: skip
 
 
-# The program
-
-
 class _Controlled(NamedTuple):
-    """The robot's release, its unit, and the open switch that was settled before (None: none)."""
+    """A robot's release, its systemd unit, and the interrupted switch of releases ended first."""
 
     release: str | None
     service: dict[str, Any]
@@ -115,7 +109,7 @@ class _Controlled(NamedTuple):
 
 
 def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
-    """Start the robots' programs, now and at every boot. Nothing takes off by that."""
+    """Start the robots' programs, now and at every boot. No robot takes off."""
     from lpac.fleet import program
 
     config, chosen = open_fleet(fleet, robots)
@@ -125,10 +119,7 @@ def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson =
 
 @options_of(OfFleet)
 def stop(of: OfFleet, *, in_flight: InFlight = False) -> None:
-    """Stop the robots' programs, which do not start at the next boot either.
-
-    A robot in flight refuses.
-    """
+    """Stop the robots' programs, now and at every boot. A robot in flight refuses."""
     from lpac.fleet import program
 
     config, chosen = open_fleet(of.fleet, of.robots)
@@ -153,7 +144,7 @@ def restart(of: OfFleet, *, in_flight: InFlight = False) -> None:
 
 
 def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
-    """Land vehicles whose programs are gone, where they are: over SSH, by their PX4.
+    """Land vehicles whose programs have ended, where they are, through SSH and PX4.
 
     Refused while the program runs (use `lpac mission land`) and while a pilot flies.
     """
@@ -166,7 +157,7 @@ def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = 
         async with visit(config, robot, report) as (session, _):
             return await program.land(session, robot, report)
 
-    tell(
+    print_results(
         config, run_for_each(chosen, one), "landing:", as_json=as_json,
         describe=lambda v: {"mode": v["mode"], "armed": v["armed"]},
         cells=lambda v: (styled("it lands" if v["armed"] else "it has landed", GOOD),),
@@ -183,7 +174,7 @@ def _control(
     change: Callable[["Session", "RobotHost"], Awaitable[None]],
     as_json: bool,
 ) -> None:
-    """Change the unit on all robots, hold them for that, print it."""
+    """Lock each robot, change its systemd unit, and print the results."""
     from lpac.fleet.hold import hold
 
     async def one(robot: "RobotHost", report: "Report") -> _Controlled:
@@ -196,7 +187,7 @@ def _control(
     for outcome in outcomes:
         if outcome.value and outcome.value.recovered and not as_json:
             typer.echo(f"{outcome.robot.name}: {outcome.value.recovered}")
-    tell(
+    print_results(
         config, outcomes, _DONE[step], as_json=as_json, describe=_Controlled._asdict,
         headings=("release", "flight"),
         cells=lambda v: ((v.release or "")[:SHORT], flight(v.service), program(v.service)),
@@ -214,12 +205,9 @@ def _without_spares(
     return [robot for robot in robots if robot.name not in spares]
 
 
-# Looking
-
-
 @contextmanager
-def _while_somebody_reads() -> Iterator[None]:
-    """End as other programs do when `head` or `grep -m1` has read enough, after all sessions."""
+def _end_on_closed_pipe() -> Iterator[None]:
+    """End of SIGPIPE, once all sessions have, if `head` or `grep -m1` closed stdout."""
     try:
         yield
     except* BrokenPipeError:
@@ -227,19 +215,21 @@ def _while_somebody_reads() -> Iterator[None]:
         signal.raise_signal(signal.SIGPIPE)
 
 
-@_while_somebody_reads()
+@_end_on_closed_pipe()
 def logs(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
     follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Also new lines as they come, until Ctrl-C.")
+        bool, typer.Option("--follow", "-f", help="Also show new lines, until Ctrl-C.")
     ] = False,
     lines: Annotated[
-        int, typer.Option("--lines", "-n", min=0, help="How many of each robot's last lines.")
+        int, typer.Option("--lines", "-n", min=0, help="Number of last lines of each robot.")
     ] = 50,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object per line.")
+    ] = False,
 ) -> None:
-    """Show what the robots' programs, and systemd about them, have written, by time."""
+    """Show the logs of the robots' programs, with systemd's messages, in order of time."""
     from lpac.fleet.logs import Entry, read_journal, readable
 
     config, chosen = open_fleet(fleet, robots)
@@ -267,11 +257,11 @@ def logs(
     require_all(outcomes, "read the journal of")
 
 
-@_while_somebody_reads()
+@_end_on_closed_pipe()
 def execute_on_all(
     command: Annotated[
         list[str],
-        typer.Argument(help="Program and arguments; or one text for the robot's shell."),
+        typer.Argument(help="Program and arguments, or one string for the robot's shell."),
     ],
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
@@ -317,7 +307,7 @@ def _run_plainly(
     task: Callable[["RobotHost"], Awaitable[T]],
     label: dict[str, str],
 ) -> list["Outcome[T]"]:
-    """Without a table: the output is what counts. Problems are told on stderr as they come."""
+    """Run without a table, since the output counts; print problems on stderr as they come."""
 
     def on_outcome(outcome: "Outcome[T]") -> None:
         if outcome.problem is not None and not outcome.interrupted:
@@ -327,7 +317,7 @@ def _run_plainly(
 
 
 def _labels(robots: Sequence["RobotHost"]) -> dict[str, str]:
-    """Label before each robot's lines."""
+    """Prefix of each robot's lines."""
     width = max(len(robot.name) for robot in robots)
     return {
         robot.name: typer.style(robot.name.ljust(width), fg=_COLOURS[n % len(_COLOURS)]) + "  "

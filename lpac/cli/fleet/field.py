@@ -1,4 +1,4 @@
-"""`lpac fleet`: the day in the field: is everything well, may it fly?"""
+"""`lpac fleet doctor` and `up`: check the fleet in the field, and decide go or no-go."""
 
 import json
 import time
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 
 _STYLES = {"ok": GOOD, "skipped": FAINT, "warning": NOTABLE, "FAILED": BAD}
 
-# doctor
-
 
 def doctor(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
-    laptop: Annotated[bool, typer.Option("--laptop", help="This machine, not the robots.")] = False,
+    laptop: Annotated[
+        bool, typer.Option("--laptop", help="Check this machine, not the robots.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Look for whatever would keep the robots from flying, and say how to mend it.
+    """Find what would keep the robots from flying, and print how to fix it.
 
-    Changes nothing, except that a robot whose program does not run has its PX4 parameters set if
-    its configuration says so.
+    Changes nothing, with one exception: PX4 parameters of a robot whose program does not run are
+    set if its configuration says so.
     """
     from lpac.fleet.doctor import Diagnosis, diagnose
     from lpac.fleet.laptop import examine_laptop
@@ -83,13 +83,13 @@ def _print_board(diagnoses: "Sequence[Diagnosis]") -> None:
 def _verdict(verdict: str | None) -> "Text":
     if verdict is None:
         return styled("", FAINT)
-    # Ten robots are to fit into a terminal.
+    # Ten robots must fit into a terminal.
     short = {"skipped": "-", "warning": "warn"}.get(verdict, verdict)
     return styled(short, _STYLES[verdict])
 
 
 def _print_findings(diagnoses: "Sequence[Diagnosis]") -> None:
-    """Print the findings that are not well, the worst first; those of several robots once."""
+    """Print checks that are not ok, the worst first; one line for robots with the same finding."""
     notes: list[tuple[str, str | Text]] = []
     for verdict in ("FAILED", "warning", "skipped"):
         found: dict[tuple[str, str], dict[str, str]] = {}
@@ -101,7 +101,7 @@ def _print_findings(diagnoses: "Sequence[Diagnosis]") -> None:
             notes.append((", ".join(fixes), styled(f"{name}: {text}", _STYLES[verdict])))
             first, *others = dict.fromkeys(fixes.values())
             if first:
-                also = f"   (and so on {', '.join([*fixes][1:])})" if others else ""
+                also = f"   (likewise on {', '.join([*fixes][1:])})" if others else ""
                 notes.append(("", f"  → {first}{also}"))
     print_notes(notes)
 
@@ -117,8 +117,8 @@ def _print_multicast(config: "FleetConfig") -> None:
         lost = f"{seldom:.0%} to {often:.0%}" if least < most else f"{often:.0%}"
         typer.echo(
             f"multicast: a message in {cost.payload} takes {numbers} "
-            f"datagram{'s' if several else ''}{', all or nothing' if several else ''}: where 1 of "
-            f"20 is lost, {lost} of messages are"
+            f"datagram{'s' if several else ''}{', all or nothing' if several else ''}: if 1 in 20 "
+            f"is lost, so are {lost} of messages"
         )
 
 
@@ -141,21 +141,18 @@ def _require_none_failed(diagnoses: "Sequence[Diagnosis]") -> None:
         raise ValueError(f"{counted(count, 'check')} failed, on {', '.join(failed)}")
 
 
-# up
-
-
 @options_of(OfFleet)
 def up(
     of: OfFleet,
     *,
-    timeout: Annotated[float, typer.Option(help="How long robots are waited for, s.")] = 40.0,
+    timeout: Annotated[float, typer.Option(help="How long to wait for the robots, s.")] = 40.0,
     trial: Annotated[
-        float, typer.Option(min=1.0, help="A trial's duration, s: how many is a pack good for?")
+        float, typer.Option(min=1.0, help="A trial's duration, s, to count what each pack lasts.")
     ] = 60.0,
 ) -> None:
-    """Wait for the robots, set their clocks, start their programs, look at all: go or no-go.
+    """Wait for the robots, set their clocks, start their programs, check all: go or no-go.
 
-    Without --robots for all that have a slot. Nothing takes off.
+    All robots that have a slot, unless --robots is given. No robot takes off.
     """
     from lpac.fleet.up import batteries_of, combine_checks, decide
 
@@ -187,7 +184,7 @@ def up(
 
 
 def _in_slots(config: "FleetConfig", robots: Sequence["RobotHost"]) -> list["RobotHost"]:
-    """Raises ValueError if none is."""
+    """Select the robots that have a slot. Raises ValueError if there are none."""
     chosen = [robot for robot in robots if config.slot_of(robot.name) is not None]
     if not chosen:
         raise ValueError(f"{config.path}: slots: no robot has one")
@@ -197,7 +194,7 @@ def _in_slots(config: "FleetConfig", robots: Sequence["RobotHost"]) -> list["Rob
 def _print_remarks(config: "FleetConfig", trial_s: float) -> None:
     if config.insecure:
         typer.secho("insecure: anyone on the network can fly this fleet", fg="yellow")
-    typer.echo(f"trials: how many of {trial_s:g} s each pack lasts for; --trial SECONDS for others")
+    typer.echo(f"trials: number of {trial_s:g} s that each pack lasts; --trial SECONDS for others")
 
 
 def _bring_up(

@@ -1,4 +1,4 @@
-"""`lpac fleet init`, `operator`, `members`, `revoke` and `rotate`: who belongs to the fleet."""
+"""`lpac fleet init`, `operator`, `members`, `revoke` and `rotate`: keys and membership."""
 
 import json
 from pathlib import Path
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def init(
     fleet: Fleet = DEFAULT_FLEET,
     name: Annotated[
-        str, typer.Option("--name", help="What you are called in the fleet; else user@host.")
+        str, typer.Option("--name", help="Your name in the fleet; else user@host.")
     ] = "",
 ) -> None:
     """Make the fleet's keys on this computer; the first `enroll` does it too."""
@@ -32,23 +32,22 @@ def init(
     authority = make_authority(load_fleet(fleet), name or user_at_host())
     typer.echo(f"made the fleet's keys: {authority.folder}")
     typer.echo(
-        "keep a copy of that folder where nobody else can read it: whoever has it can fly the "
-        "fleet, and without it no robot joins"
+        "keep a copy of that folder where nobody else can read it: anyone who has it can fly the "
+        "fleet, and without it no robot can join"
     )
 
 
 def operator(
-    name: Annotated[str, typer.Argument(help="What that ground station is called.")],
-    out: Annotated[Path, typer.Option(help="The new folder that its laptop gets.")],
+    name: Annotated[str, typer.Argument(help="The ground station's name.")],
+    out: Annotated[Path, typer.Option(help="New folder, to be moved to its laptop.")],
     fleet: Fleet = DEFAULT_FLEET,
     observer: Annotated[
-        bool, typer.Option("--observer", help="It may ask the fleet to hold, and nothing else.")
+        bool, typer.Option("--observer", help="It may only ask the fleet to hold.")
     ] = False,
 ) -> None:
-    """Make another laptop a ground station of the fleet: the folder OUT, for it alone.
+    """Make keys, in the folder OUT, for another laptop as a ground station of the fleet.
 
-    A key that NAME had before is taken off the list of members, which all robots that answer are
-    brought.
+    An earlier key of NAME leaves the list of members. All robots that answer get the new list.
     """
     from edge.identity.members import Role
     from lpac.fleet.authority import new_member
@@ -56,7 +55,7 @@ def operator(
     from lpac.fleet.settings import load_fleet
 
     if out.exists():
-        raise ValueError(f"{out}: is there already: give a new folder")
+        raise ValueError(f"{out}: exists: give a new folder")
     role = Role.OBSERVER if observer else Role.OPERATOR
     config = load_fleet(fleet)
     authority, snapshot = open_authority(config), _snapshot(config)
@@ -69,8 +68,8 @@ def operator(
     typer.echo(f"{out}: {name} is an {role} of fleet {config.fleet}")
     send_list(config)
     typer.echo(
-        f"move the folder to that laptop, by a way that nobody else can read, and name it there "
-        f'in {fleet.name}: keys = "FOLDER"'
+        "move the folder to that laptop, so that nobody else can read it, and name it there in "
+        f'{fleet.name}: keys = "FOLDER"'
     )
 
 
@@ -102,7 +101,7 @@ def _facts(member: "Member") -> dict[str, object]:
 
 
 def send_list(config: "FleetConfig") -> None:
-    """Bring the list of members to all robots that answer, and print which do not."""
+    """Send the list of members to all robots, and print which do not answer."""
     from lpac.fleet.members import send_members_to
 
     async def one(robot: "RobotHost", report: "Report") -> None:
@@ -111,20 +110,20 @@ def send_list(config: "FleetConfig") -> None:
     outcomes = run_for_each(tuple(config.robots.values()), one)
     if any(outcome.problem is not None for outcome in outcomes):
         print_problems(outcomes)
-        typer.echo("these keep the list of members that they have until `lpac fleet up`")
+        typer.echo("these keep their old list of members until `lpac fleet up`")
 
 
 def revoke(
     name: Annotated[str, typer.Argument(help="A robot or a ground station of the fleet.")],
     fleet: Fleet = DEFAULT_FLEET,
     in_flight: Annotated[
-        bool, typer.Option("--in-flight", help="Also if it is in the air, or commands.")
+        bool, typer.Option("--in-flight", help="Even if it is in the air, or commands.")
     ] = False,
 ) -> None:
-    """Let nobody listen to NAME any more: its drone or laptop was lost.
+    """Exclude NAME from the fleet, for example if its drone or laptop was lost.
 
-    It is taken off the list of members, which all robots that answer are brought, also in flight.
-    Robots keep away from where they heard one last that left.
+    It leaves the list of members. All robots that answer get the new list, also in flight. They
+    keep away from where they last heard a robot that was revoked.
     """
     from lpac.fleet.members import open_authority
     from lpac.fleet.settings import load_fleet
@@ -134,20 +133,20 @@ def revoke(
     authority.named(name)
     why = _why_not_now(config, name)
     if why and not in_flight:
-        raise ValueError(f"{why}: add --in-flight if that is what you want")
+        raise ValueError(f"{why}: add --in-flight to revoke it anyway")
     authority.revoke(name)
-    typer.echo(f"{name} is no member any more")
+    typer.echo(f"{name} is no longer a member")
     send_list(config)
 
 
 def _why_not_now(config: "FleetConfig", name: str) -> str:
-    """Reason against it as far as this laptop's ground knows; "" if there is none."""
+    """Reason not to revoke it now, as far as this laptop's ground station knows, or ""."""
     snapshot = _snapshot(config)
     if snapshot is None:
-        return f"no `lpac ground` runs here, so nobody knows what {name} does now"
+        return f"no `lpac ground` runs here, so it is unknown what {name} does now"
     if snapshot.commander == name:
         return f"{name} commands the fleet"
-    return f"{name} was heard in the air last" if name in _flying(snapshot) else ""
+    return f"{name} was in the air when last heard" if name in _flying(snapshot) else ""
 
 
 def _snapshot(config: "FleetConfig") -> "FleetSnapshot | None":
@@ -156,24 +155,24 @@ def _snapshot(config: "FleetConfig") -> "FleetSnapshot | None":
     from lpac.ground.station.client import GroundError, subscribe
 
     try:
-        with subscribe(config.fleet) as told:
-            return next(t for t in told if isinstance(t, FleetSnapshot))
+        with subscribe(config.fleet) as answers:
+            return next(each for each in answers if isinstance(each, FleetSnapshot))
     except GroundError:
         return None
 
 
 def _flying(snapshot: "FleetSnapshot") -> list[str]:
-    """Robots that were last heard in the air."""
+    """Robots that were in the air when last heard."""
     from lpac.ground.station.station import is_down
 
     return [r.name for r in snapshot.robots if r.status is not None and not is_down(r.status)]
 
 
 def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
-    """Renew everybody's keys: robots on the ground get new ones, and this computer.
+    """Renew the keys of the robots on the ground, and of this computer without --robots.
 
-    The old keys leave the list of members. A robot in flight refuses, and keeps its own; so does
-    this computer while one flies that its `lpac ground` may command.
+    The old keys leave the list of members. A robot in flight refuses, and keeps its key. Without
+    --robots, nothing is renewed while `lpac ground` on this computer has a robot in flight.
     """
     from edge.identity.members import Role
     from lpac.fleet.authority import new_member
@@ -184,8 +183,8 @@ def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
     snapshot = _snapshot(config) if robots is None else None
     if snapshot is not None and (flying := _flying(snapshot)):
         raise ValueError(
-            f"{', '.join(flying)} flew when last heard, and would lose this computer's ground: "
-            "land them first, or name the robots that are to get new keys"
+            f"{', '.join(flying)}: in the air when last heard, and would lose this computer's "
+            "ground station: land them first, or choose other robots with --robots"
         )
 
     async def one(robot: "RobotHost", report: "Report") -> None:

@@ -1,4 +1,4 @@
-"""`lpac fleet enroll`, `swap` and `pull`: a robot comes, one is replaced, a trial is taken home."""
+"""`lpac fleet enroll`, `swap` and `pull`: add robots, replace one, and fetch its logs."""
 
 import asyncio
 import sys
@@ -10,7 +10,7 @@ import typer
 
 from lpac.cli.fields import flag_of, options_of
 from lpac.cli.fleet.keys import send_list
-from lpac.cli.fleet.progress import run_for_each, tell
+from lpac.cli.fleet.progress import print_results, run_for_each
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
 from lpac.cli.printing import GOOD, styled
 
@@ -31,7 +31,7 @@ class EnrollOptions:
 
     name: Annotated[
         str | None,
-        typer.Argument(help="The robot's name in the fleet, such as r11; else all of the file."),
+        typer.Argument(help="The robot's name in the fleet, such as r11; else all in the file."),
     ] = None
     host: Annotated[
         str | None,
@@ -40,24 +40,24 @@ class EnrollOptions:
         ),
     ] = None
     fleet: Fleet = DEFAULT_FLEET
-    user: Annotated[str | None, "Who logs in: root (the default), or a user with sudo."] = None
-    port: Annotated[int | None, "Its ssh port, if not ssh's own."] = None
+    user: Annotated[str | None, "Its login: root (the default), or a user with sudo."] = None
+    port: Annotated[int | None, "Its SSH port, if not ssh's default."] = None
     address: Annotated[
-        str | None, "Its IPv4 address for the other robots, if HOST's is not that."
+        str | None, "Its IPv4 address for the other robots, if it is not HOST's."
     ] = None
     robot_id: Annotated[
-        int | None, "Its id in the fleet; by default, if new, the number in its name."
+        int | None, "Its id in the fleet; for a new robot by default the number in its name."
     ] = None
     yes: Annotated[bool, "Even if it is enrolled as another robot."] = False
 
 
 @options_of(EnrollOptions)
 def enroll(of: EnrollOptions) -> None:
-    """Make a computer with a vehicle a robot of the fleet; may be repeated at any time.
+    """Make a vehicle's computer a robot of the fleet; may be repeated at any time.
 
-    It gets a key, a place in the fleet's file as a spare, an id, and a line in the list of members,
-    which all robots that answer are brought; voxl-vision-hub is set, programs that commanded the
-    vehicle before are stopped; then come the release and PX4's parameters. ssh asks for the
+    It gets a key, an id, a place in the fleet's file as a spare, and a line in the list of members.
+    All robots that answer get the new list. voxl-vision-hub is set up, and other programs that
+    command the vehicle are stopped. Then the release and PX4's parameters follow. ssh asks for the
     password, if it is needed.
     """
     from lpac.fleet.settings import load_fleet
@@ -66,7 +66,7 @@ def enroll(of: EnrollOptions) -> None:
         for option in ("host", "user", "port", "address", "robot_id"):
             if getattr(of, option) is not None:
                 flag = option if option == "host" else flag_of(option)
-                raise ValueError(f"{flag} is one robot's: give its name too")
+                raise ValueError(f"{flag} is for one robot: give its name too")
     names = list(load_fleet(of.fleet).robots) if of.name is None else [of.name]
     if not names:
         raise ValueError(f"{of.fleet}: has no robots yet: give a name and an address")
@@ -85,8 +85,8 @@ def enroll(of: EnrollOptions) -> None:
         raise ValueError("; ".join(left))
     are = "is" if len(names) == 1 else "are"
     typer.echo(
-        f"{', '.join(names)} {are} enrolled; `lpac fleet doctor --robots {','.join(names)}` looks "
-        "at the rest"
+        f"{', '.join(names)} {are} enrolled; `lpac fleet doctor --robots {','.join(names)}` checks "
+        "the rest"
     )
 
 
@@ -100,14 +100,14 @@ def _members(fleet: Path) -> bytes | None:
 
 
 def _enroll(name: str, of: EnrollOptions) -> list[str]:
-    """Print each step; those that are left to do."""
+    """Enroll a robot, print each step, and return those left to do."""
     from lpac.fleet.enroll import enroll as enroll_robot
     from lpac.fleet.setup import EnrollStep
 
     left: list[str] = []
 
     def on_step(step: EnrollStep) -> None:
-        _say("")
+        _show_step("")
         typer.echo(f"{step.name:{_STEP_WIDTH}} {step.outcome}")
         for note in step.notes:
             typer.echo(f"{'':{_STEP_WIDTH}} {note}")
@@ -118,7 +118,7 @@ def _enroll(name: str, of: EnrollOptions) -> list[str]:
         enroll_robot(
             of.fleet, name, of.host, user=of.user, port=of.port, address=of.address,
             robot_id=of.robot_id, rename=of.yes, operator=user_at_host, on_step=on_step,
-            on_progress=_say,
+            on_progress=_show_step,
         )
     )  # fmt: skip
     return left
@@ -136,10 +136,10 @@ def swap(
     from lpac.fleet.swap import swap as swap_robots
 
     def report(step: str, share: float | None) -> None:
-        _say(step if share is None else f"{step} {100.0 * share:.0f} %")
+        _show_step(step if share is None else f"{step} {100.0 * share:.0f} %")
 
     swapped = asyncio.run(swap_robots(fleet, failed, spare, report, user_at_host))
-    _say("")
+    _show_step("")
     _print_swapped(fleet, failed, spare, swapped)
 
 
@@ -150,8 +150,7 @@ def _print_swapped(fleet: Path, failed: str, spare: str, swapped: "Swapped") -> 
     deployed = swapped.deployed
     if not swapped.changed:
         typer.secho(
-            f"{spare:6} had the slot already; the other way round it is `lpac fleet swap {spare} "
-            f"{failed}`",
+            f"{spare:6} had the slot already; to swap back: `lpac fleet swap {spare} {failed}`",
             fg="yellow",
         )
     if swapped.not_stopped is None:
@@ -184,14 +183,14 @@ def pull(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
     trial: Annotated[
-        str | None, typer.Option(help="Only what belongs to it; else whatever is new.")
+        str | None, typer.Option(help="Only this trial; else all that is new.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder of trials.")] = Path("trials"),
     as_json: AsJson = False,
 ) -> None:
     """Fetch flight logs, PX4's logs and parameters, journal and configuration; may be repeated.
 
-    They come to OUT/TRIAL/ROBOT, checked against the robots' checksums. A robot in flight refuses.
+    They go to OUT/TRIAL/ROBOT, verified by checksum. A robot in flight refuses.
     """
     from lpac.fleet.pull import pull as pull_from
 
@@ -200,7 +199,7 @@ def pull(
     async def one(robot: "RobotHost", report: "Report") -> "Pulled":
         return await pull_from(config, robot, trial, out, report)
 
-    tell(
+    print_results(
         config, run_for_each(chosen, one), "pulled from", as_json=as_json, cells=_pulled_cells,
         numbers=("files", "MB", "MB sent"), describe=lambda pulled: pulled._asdict(),
     )  # fmt: skip
@@ -211,7 +210,7 @@ def _pulled_cells(value: "Pulled") -> tuple["str | Text", ...]:
     return str(value.files), *sizes, styled(value.summary, GOOD)
 
 
-def _say(text: str) -> None:
+def _show_step(text: str) -> None:
     """Show the present step, on a terminal only; the next text takes its place."""
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{text[:78]}")

@@ -39,9 +39,9 @@ def run_all(
     task: Callable[["RobotHost"], Awaitable[T]],
     on_outcome: Callable[["Outcome[T]"], None],
 ) -> list["Outcome[T]"]:
-    """Do `task` with all robots side by side until all are done, or Ctrl-C; the outcomes in order.
+    """Run `task` on all robots at once until all are done, or Ctrl-C; return outcomes in order.
 
-    `on_outcome` hears each as it comes.
+    `on_outcome` is called with each as it comes.
     """
     from lpac.fleet.operations import Outcome, for_each
 
@@ -63,9 +63,9 @@ def run_all(
 def run_for_each(
     robots: Sequence["RobotHost"], task: Callable[["RobotHost", "Report"], Awaitable[T]]
 ) -> list["Outcome[T]"]:
-    """`run_all` with a task that reports its steps.
+    """`run_all` for a task that reports its steps.
 
-    On stderr: a live table, or a line for each step where there is no terminal.
+    Shows them on stderr: in a live table, or a line per step without a terminal.
     """
     progress = _Progress({robot.name: _Row(robot.name, robot.host) for robot in robots})
 
@@ -84,7 +84,7 @@ def run_for_each(
 
 
 def print_problems(outcomes: Sequence["Outcome[T]"]) -> None:
-    """Why it was not done, for each robot where it was not."""
+    """Print the problem of each robot that has one."""
     print_notes([(o.robot.name, styled(o.problem, BAD)) for o in outcomes if o.problem is not None])
 
 
@@ -93,7 +93,7 @@ def print_json(
     outcomes: Sequence["Outcome[T]"],
     describe: Callable[[T], Mapping[str, object]],
 ) -> None:
-    """One object: each robot with its `problem`, null if it did it, and then what it has."""
+    """Print one object: each robot's host, `problem` (null if none), and keys of `describe`."""
     robots = {
         outcome.robot.name: {
             "host": outcome.robot.host,
@@ -105,7 +105,7 @@ def print_json(
     typer.echo(json.dumps({"fleet": config.fleet, "robots": robots}, indent=2))
 
 
-def tell(
+def print_results(
     config: "FleetConfig",
     outcomes: Sequence["Outcome[T]"],
     done: str,
@@ -130,7 +130,7 @@ def print_outcomes(
     headings: Sequence[str] = (),
     numbers: Sequence[str] = (),
 ) -> None:
-    """A row for each robot: cells of `headings`, of `numbers`, and the result; below, why not."""
+    """Print a row per robot: cells of `headings` and `numbers`, and the result; then problems."""
     failed = [*[""] * len((*headings, *numbers)), styled("failed", BAD)]
     rows = [
         [o.robot.name, *(failed if o.problem is not None else cells(cast(T, o.value)))]
@@ -141,7 +141,7 @@ def print_outcomes(
 
 
 def require_all(outcomes: Sequence["Outcome[T]"], done: str) -> None:
-    """Raises ValueError, such as "stopped on 2 of 3 robots; failed: r2", unless all did it."""
+    """Raise ValueError, such as "stopped on 2 of 3 robots; failed: r2", unless all succeeded."""
     from edge.core.counted import counted
 
     failed = [outcome.robot.name for outcome in outcomes if outcome.problem is not None]
@@ -155,7 +155,7 @@ def require_all(outcomes: Sequence["Outcome[T]"], done: str) -> None:
 
 @dataclass(slots=True)
 class _Row:
-    """How far one robot is; `share` of the step is done where that is known."""
+    """Progress of a robot; `share` of its step is done, None if unknown."""
 
     name: str
     host: str
@@ -167,7 +167,7 @@ class _Row:
 class _Progress:
     def __init__(self, rows: dict[str, _Row]) -> None:
         self.rows = rows
-        self._view = LiveView(self._table, self._how_far)
+        self._view = LiveView(self._table, self._status_line)
         self.shown = self._view.shown
 
     def show(self, name: str, step: str, share: float | None) -> None:
@@ -182,8 +182,8 @@ class _Progress:
             self._line(name, problem or "done")
         row.outcome = ("done", GOOD) if problem is None else (problem, BAD)
 
-    def _how_far(self) -> str:
-        """In one line, of those that are not done."""
+    def _status_line(self) -> str:
+        """Steps of the robots that are not done, in one line."""
         return "; ".join(
             f"{row.name}  {row.step}" + ("" if row.share is None else f" {row.share:.0%}")
             for row in list(self.rows.values())
@@ -199,10 +199,10 @@ class _Progress:
         from rich.text import Text
 
         table = new_table(narrow=False, heading=False)
-        # Of no robots, as after none has come up, there is a table too.
+        # There may be no robots, for example if none came up.
         names = max((len(row.name) for row in self.rows.values()), default=0)
         hosts = max((len(row.host) for row in self.rows.values()), default=0)
-        # Of one width all the time, whatever the present steps are; outcomes have the rest.
+        # Fixed widths, so that the table does not jump between steps; outcomes get the rest.
         for width in (names, hosts, _STEP_WIDTH, _BAR_WIDTH, None):
             table.add_column(no_wrap=True, min_width=width)
         for row in self.rows.values():

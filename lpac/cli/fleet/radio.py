@@ -1,4 +1,4 @@
-"""`lpac fleet radio`: does the radio carry the fleet? Asked before a flight, on the ground."""
+"""`lpac fleet radio`: measure before a flight whether the radio carries the fleet."""
 
 import json
 import time
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     from lpac.radio.pairs import Pair, Window
     from lpac.radio.verdict import RadioVerdict, Room
 
-# Counts are in a status of every two seconds.
+# A robot sends counts every 2 s.
 _HEARD_WITHIN_S = 6.0
 _LOOK_S = 0.2
-_NOT_TOLD = "not told by the radio"
+_NOT_REPORTED = "not reported"
 
 
-class _Heard(NamedTuple):
-    """Measurement, and its verdict."""
+class _Result(NamedTuple):
+    """Measurement, its verdict, and the outcomes of reading the robots' Wi-Fi."""
 
     checked: "Checked"
     pairs: "Sequence[Pair]"
     verdict: "RadioVerdict"
     stream: "BulkStream | None"
-    asked: "Sequence[Outcome[list[Interface]]]"
+    wifi_outcomes: "Sequence[Outcome[list[Interface]]]"
 
 
 def radio(
@@ -51,7 +51,7 @@ def radio(
         float, typer.Option(min=10.0, max=3600.0, help="How long to listen, s.")
     ] = 20.0,
     load: Annotated[
-        bool, typer.Option("--load", help="With a bulk stream from the first robot meanwhile.")
+        bool, typer.Option("--load", help="Also send a bulk stream from the first robot.")
     ] = False,
     out: Annotated[
         Path | None, typer.Option("--out", help="A folder for the heat map: radio.png and .pdf.")
@@ -61,46 +61,43 @@ def radio(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure who hears whom, as robots on the ground speak: does the radio carry the fleet?
+    """Measure how well robots on the ground receive each other: does the radio carry the fleet?
 
-    Needs `lpac ground`, and robots with a mission origin; nothing is asked of them. Spares
-    are left out. With --robots these alone are judged, on the air that all robots share.
+    Needs `lpac ground`, and robots with a mission origin; commands nothing. Spares are left out.
+    With --robots only these are judged; all robots share the channel.
     """
     config, chosen = open_fleet(fleet, robots)
-    heard = _measured(config, chosen, seconds, load=load)
-    checked, told = heard.checked, heard.verdict
+    result = _measure(config, chosen, seconds, load=load)
+    checked, verdict = result.checked, result.verdict
     if record is not None:
-        _write(record, heard)
+        _write(record, result)
     if out is not None:
         from lpac.radio.heat_map import draw
 
-        draw(checked.robots, heard.pairs, f"{config.fleet}: {told.sentence}", out / "radio")
+        draw(checked.robots, result.pairs, f"{config.fleet}: {verdict.sentence}", out / "radio")
     if as_json:
-        typer.echo(json.dumps({"fleet": config.fleet, **_described(heard)}, indent=2))
+        typer.echo(json.dumps({"fleet": config.fleet, **_described(result)}, indent=2))
     else:
-        _print_pairs(checked, heard.pairs)
-        _print_wifi(checked, heard.asked)
-        _print_verdict(heard)
-    if told.problems:
-        raise ValueError(f"radio: {told.sentence}")
+        _print_pairs(checked, result.pairs)
+        _print_wifi(checked, result.wifi_outcomes)
+        _print_verdict(result)
+    if verdict.problems:
+        raise ValueError(f"radio: {verdict.sentence}")
 
 
-def _write(record: Path, heard: _Heard) -> None:
+def _write(record: Path, result: _Result) -> None:
     from lpac.radio.records import write_records
 
-    write_records(record, heard.checked.records(heard.pairs))
-    if not heard.asked:
-        note = "these robots are simulated on this computer: what is recorded is of no radio"
+    write_records(record, result.checked.records(result.pairs))
+    if not result.wifi_outcomes:
+        note = "the robots are simulated on this computer: no radio was measured"
         typer.echo(f"note: {note}", err=True)
 
 
-# Measuring
-
-
-def _measured(
+def _measure(
     config: "FleetConfig", robots: Sequence["RobotHost"], seconds: float, *, load: bool
-) -> _Heard:
-    """Listen to those that have a slot. Raises ValueError."""
+) -> _Result:
+    """Measure the robots that have a slot. Raises ValueError."""
     from edge.policy.bundle import load_bundle
     from lpac.ground.station.subscriber import GroundSubscriber
     from lpac.radio.airtime import MESSAGE_BYTES
@@ -108,10 +105,10 @@ def _measured(
 
     chosen = [robot for robot in robots if config.slot_of(robot.name) is not None]
     if len(chosen) < 2:
-        raise ValueError("radio: two robots or more with a slot are needed to hear each other")
+        raise ValueError("radio: needs two or more robots with a slot")
     computers = [robot for robot in chosen if robot.has_computer]
     if load and not computers:
-        raise ValueError("--load: the robots are no computers that could send a bulk stream")
+        raise ValueError("--load: no robot has a computer that could send a bulk stream")
     judged = load_bundle(config.bundle).manifest.payload_types
     payload = config.robot_config(chosen[0].name).policy.payload_of(judged)
     with interruptible("radio", "nothing was changed"), GroundSubscriber(config.fleet) as ground:
@@ -121,24 +118,24 @@ def _measured(
         after = _read_wifi(config, computers)
     checked = _checked(config, chosen, windows, before, after, MESSAGE_BYTES[payload], loaded=load)
     pairs = checked.pairs()
-    return _Heard(checked, pairs, verdict(checked, pairs), stream, after)
+    return _Result(checked, pairs, verdict(checked, pairs), stream, after)
 
 
 def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load: bool) -> None:
-    """Raises ValueError that says what the operator has to do first."""
+    """Raise ValueError, with the remedy, unless the robots send counts."""
     from lpac.radio.verdict import WHAT_RUNS, obstacles
 
     statuses: dict[str, RobotStatus] = {}
 
-    def all_told(snapshot: "FleetSnapshot") -> bool:
-        for name, status in _heard(snapshot, names).items():
-            # Not each status has counts.
+    def all_reported(snapshot: "FleetSnapshot") -> bool:
+        for name, status in _fresh_statuses(snapshot, names).items():
+            # Only some statuses have counts.
             if status.radio_counts is not None or statuses.get(name) is None:
                 statuses[name] = status
         return len(statuses) == len(names) and all(s.radio_counts for s in statuses.values())
 
-    # Who is not heard is missed later.
-    ground.wait_for(all_told, _HEARD_WITHIN_S)
+    # The verdict lists robots that are not heard.
+    ground.wait_for(all_reported, _HEARD_WITHIN_S)
     if not statuses:
         raise ValueError(f"radio: no robot is heard: {WHAT_RUNS}")
     hindrances = obstacles(statuses)
@@ -149,8 +146,8 @@ def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load:
         raise ValueError(f"--load: {', '.join(armed)}: armed: disturb no radio in flight")
 
 
-def _heard(snapshot: "FleetSnapshot", names: Sequence[str]) -> dict[str, "RobotStatus"]:
-    """Statuses of those of them that are heard now."""
+def _fresh_statuses(snapshot: "FleetSnapshot", names: Sequence[str]) -> dict[str, "RobotStatus"]:
+    """Statuses of the named robots that are heard now."""
     return {
         robot.name: robot.status
         for robot in snapshot.robots
@@ -164,7 +161,7 @@ def _listen(
     seconds: float,
     bulk_from: "RobotHost | None",
 ) -> tuple[dict[str, "Window"], "BulkStream | None"]:
-    """Of all robots with a slot: who is not judged takes airtime, too."""
+    """Count messages of all robots with a slot: the others take airtime from those judged."""
     from lpac.fleet.wifi import bulk_stream
     from lpac.radio.pairs import Window
 
@@ -172,13 +169,13 @@ def _listen(
     windows: dict[str, Window] = {}
 
     def take(snapshot: "FleetSnapshot") -> bool:
-        for name, status in _heard(snapshot, names).items():
+        for name, status in _fresh_statuses(snapshot, names).items():
             known = windows.get(name)
             if status.radio_counts is None:
                 continue
-            # A program that starts again counts anew.
-            again = known is None or known.first.boot_nonce != status.boot_nonce
-            windows[name] = Window(status if known is None or again else known.first, status)
+            # A restarted program counts from zero.
+            restarted = known is None or known.first.boot_nonce != status.boot_nonce
+            windows[name] = Window(status if known is None or restarted else known.first, status)
         return False
 
     stream = nullcontext() if bulk_from is None else bulk_stream(config, bulk_from)
@@ -187,7 +184,7 @@ def _listen(
         began_s = time.monotonic()
         while (passed_s := time.monotonic() - began_s) < seconds:
             progress.update(task, completed=int(passed_s))
-            # Each picture, since not each status has counts. Raises once the ground has ended.
+            # Take each snapshot, since only some statuses have counts. Raises if the ground ends.
             ground.wait_for(take, min(_LOOK_S, seconds - passed_s))
     return {name: w for name, w in windows.items() if w.duration_s > 0.0}, streaming
 
@@ -232,11 +229,8 @@ def _checked(
     )
 
 
-# Telling
-
-
 def _print_pairs(checked: "Checked", found: Sequence["Pair"]) -> None:
-    """Tables of who hears whom."""
+    """Print a table per measure: rows of receivers, columns of senders."""
     from lpac.radio.pairs import LATE_S
 
     names = checked.robots
@@ -245,7 +239,7 @@ def _print_pairs(checked: "Checked", found: Sequence["Pair"]) -> None:
         ("arrived, %", partial(_delivered, expected_loss=checked.expected_loss)),
         ("age p99, s", _age), (f"{LATE_S:g} s old or older, %", _late),
     ):  # fmt: skip
-        typer.echo(f"{heading}: a row hears, a column says")
+        typer.echo(f"{heading}: a row receives, a column sends")
         rows: list[list[str | Text]] = [
             [receiver, *(
                 cell(pair) if (pair := by_link.get((receiver, sender)))
@@ -258,28 +252,28 @@ def _print_pairs(checked: "Checked", found: Sequence["Pair"]) -> None:
         typer.echo()
 
 
-def _print_wifi(checked: "Checked", asked: "Sequence[Outcome[list[Interface]]]") -> None:
-    if asked:
+def _print_wifi(checked: "Checked", outcomes: "Sequence[Outcome[list[Interface]]]") -> None:
+    if outcomes:
         numbers = ("signal dBm", "rate Mbit/s", "channel busy %")
         rows: list[list[str | Text]] = [
             [name, *_wifi_cells(checked.wifi.get(name))] for name in checked.robots
         ]
         print_table(("robot", *numbers), rows, numbers)
-        print_problems(asked)
+        print_problems(outcomes)
         typer.echo()
 
 
-def _print_verdict(heard: _Heard) -> None:
-    told, stream = heard.verdict, heard.stream
+def _print_verdict(result: _Result) -> None:
+    verdict, stream, room = result.verdict, result.stream, result.verdict.room
     if stream is not None:
         typer.echo(f"bulk stream from {stream.robot}: {stream.rate_mbit_s:.1f} Mbit/s")
-    for problem in told.problems:
+    for problem in verdict.problems:
         typer.secho(problem, fg=BAD)
-    if not told.problems:
-        typer.secho(told.sentence, fg=GOOD)
-    # A failure needs none, unless it is the model that finds the channel too small.
-    if told.room is not None and (not told.problems or told.room.carries < told.room.robots):
-        typer.secho(_basis(heard.checked, told.room), dim=True)
+    if not verdict.problems:
+        typer.secho(verdict.sentence, fg=GOOD)
+    # A failure needs no model, unless it is the model that finds the channel too small.
+    if room is not None and (not verdict.problems or room.carries < room.robots):
+        typer.secho(_basis(result.checked, room), dim=True)
 
 
 def _basis(checked: "Checked", room: "Room") -> str:
@@ -292,15 +286,15 @@ def _basis(checked: "Checked", room: "Room") -> str:
     )
     if room.busy_share is not None:
         text += (
-            f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time, "
-            f"where the model has {100.0 * room.model_busy_share:.0f} %"
+            f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time and "
+            f"the model predicts {100.0 * room.model_busy_share:.0f} %"
         )
         if room.others_share > 0.0:
-            text += f"; others are taken to have {100.0 * room.others_share:.0f} %"
+            text += f"; others are assumed to take {100.0 * room.others_share:.0f} %"
     if not checked.ground_wired:
         text += (
-            "; this computer is in the Wi-Fi itself, so that what it sends and passes on crosses "
-            "the air twice"
+            "; this computer is on the Wi-Fi, so all that it sends or forwards crosses the air "
+            "twice"
         )
     return text
 
@@ -350,18 +344,18 @@ def _wifi_cells(wifi: "WifiReading | None") -> list["Text"]:
         wifi.signal_dbm, wifi.rate_mbit_s,
         None if wifi.busy_share is None else 100.0 * wifi.busy_share,
     )  # fmt: skip
-    return [styled(_NOT_TOLD, FAINT) if v is None else styled(f"{v:.0f}", "") for v in values]
+    return [styled(_NOT_REPORTED, FAINT) if v is None else styled(f"{v:.0f}", "") for v in values]
 
 
-def _described(heard: _Heard) -> dict[str, Any]:
-    checked, told, stream = heard.checked, heard.verdict, heard.stream
-    problems = {outcome.robot.name: outcome.problem for outcome in heard.asked}
+def _described(result: _Result) -> dict[str, Any]:
+    checked, verdict, stream = result.checked, result.verdict, result.stream
+    problems = {outcome.robot.name: outcome.problem for outcome in result.wifi_outcomes}
     return {
-        "ok": not told.problems,
-        "sentence": told.sentence,
-        "problems": told.problems,
+        "ok": not verdict.problems,
+        "sentence": verdict.sentence,
+        "problems": verdict.problems,
         "transport": checked.transport,
-        "room": told.room and told.room._asdict(),
+        "room": verdict.room and verdict.room._asdict(),
         "bulk_stream": stream and {"robot": stream.robot, "rate_mbit_s": stream.rate_mbit_s},
         "robots": {
             name: {
@@ -373,6 +367,6 @@ def _described(heard: _Heard) -> dict[str, Any]:
         },
         "pairs": [
             {**pair._asdict(), "delivered": pair.delivered, "late_share": pair.late_share}
-            for pair in heard.pairs
+            for pair in result.pairs
         ],
     }

@@ -1,4 +1,4 @@
-"""`lpac fleet status`: the state of each robot, and its wording."""
+"""`lpac fleet status`: the state of each robot."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from lpac.fleet.operations import Outcome
     from lpac.fleet.settings import FleetConfig, RobotHost
 
-# Characters of an id that tell it from others.
+# Characters of a shortened id.
 SHORT = 8
-# A clock that is off by more is noted: what robots log cannot be put in order.
+# A greater clock offset is noted, since logs of several robots could not be put in order.
 _CLOCK_WITHIN_S = 0.5
 
 _HEADINGS = (
@@ -28,11 +28,10 @@ _NUMBERS = ("slot", "battery", "sats", "peers", "failed\nchecks", "clock\ns")
 
 
 class State(NamedTuple):
-    """A robot's `overview`, and how far its clock is ahead of ours.
+    """A robot's `overview`, and by how much its clock is ahead of this computer's, s.
 
-    `slot` is its slot's place in the list, None for a spare. `last_words` are those of a program
-    that has failed, None if it has not. `is_configured` tells whether its configuration is what
-    fleet.toml gives now, None without a release.
+    `slot` is its slot's index, None for a spare. `last_words` is the last output of a failed
+    program, else None. `is_configured`: its configuration is fleet.toml's; None without a release.
     """
 
     overview: dict[str, Any]
@@ -43,7 +42,7 @@ class State(NamedTuple):
 
 
 def status(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
-    """Show what each robot has, and how it is."""
+    """Show each robot's release and state."""
     config, chosen = open_fleet(fleet, robots)
 
     async def one(robot: "RobotHost", _: "Report") -> "State":
@@ -58,7 +57,7 @@ def status(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson 
 
 
 async def read_state(config: "FleetConfig", robot: "RobotHost") -> State:
-    """Ask the robot; nothing of it is held or changed. Raises FleetError."""
+    """Read a robot's state, without locking or changing anything. Raises FleetError."""
     from lpac.fleet.doctor import is_configured
     from lpac.fleet.hold import visit
 
@@ -72,7 +71,7 @@ async def read_state(config: "FleetConfig", robot: "RobotHost") -> State:
 
 
 def describe(state: State) -> dict[str, object]:
-    """For JSON: the overview's keys, and the others."""
+    """Describe a state for JSON: the overview's keys, and the others."""
     return {
         **state.overview,
         "slot": state.slot,
@@ -83,10 +82,10 @@ def describe(state: State) -> dict[str, object]:
 
 
 def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) -> None:
-    """The table of the fleet, and notes on what is not as it should be."""
+    """Print the table of the fleet, and notes on problems."""
     states = {o.robot.name: o.value for o in outcomes if o.value is not None}
     parts = {name: _parts(state.overview["versions"]) for name, state in states.items()}
-    newest = max(states, key=lambda name: _number_of(states[name]), default="")
+    newest = max(states, key=lambda name: _release_number(states[name]), default="")
     behind = {name: text for name, text in parts.items() if text not in (None, parts[newest])}
     silent = ["", styled("see below", BAD), *[""] * (len(_HEADINGS) - 4)]
     rows = []
@@ -107,7 +106,7 @@ def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) ->
             notes.append((outcome.robot.name, styled(f"* behind {newest}: {has}", NOTABLE)))
         if outcome.value is not None and outcome.value.is_configured is False:
             note = (
-                f"* its configuration is not the one of {config.path.name}: lpac fleet deploy "
+                f"* its configuration is not that of {config.path.name}: lpac fleet deploy "
                 f"--robots {outcome.robot.name}"
             )
             notes.append((outcome.robot.name, styled(note, NOTABLE)))
@@ -118,7 +117,7 @@ def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) ->
 
 
 def program(service: Mapping[str, Any]) -> "Text":
-    """How the unit is, in a word or two."""
+    """State of the systemd unit, in a word or two."""
     if not service["installed"]:
         return styled("none", FAINT)
     if _failed(service):
@@ -131,47 +130,44 @@ def program(service: Mapping[str, Any]) -> "Text":
 
 
 def flight(service: Mapping[str, Any]) -> str:
-    """The state of the flight by the program's last word; empty if it does not run."""
+    """Flight state of the program's last status; "" if it does not run."""
     return str(service["status"].get("state", "")) if service["fresh"] else ""
 
 
 def _cells(state: State, behind: bool) -> list["str | Text"]:
     overview, service = state.overview, state.overview["service"]
-    said = service["status"] if service["fresh"] else {}
+    reported = service["status"] if service["fresh"] else {}
     marks = ("*" if behind or state.is_configured is False else "") + (
         "?" if overview["pending"] else ""
     )
-    armed = said.get("armed")
-    failed_checks = len(said.get("failed_checks", ()))
+    armed = reported.get("armed")
+    failed_checks = len(reported.get("failed_checks", ()))
     clock_well = abs(state.clock_offset_s) <= _CLOCK_WITHIN_S
     return [
         (overview["current"] or "none")[:SHORT] + marks,
         program(service),
         flight(service),
         "" if armed is None else styled("yes", NOTABLE) if armed else "no",
-        "" if said.get("battery") is None else f"{100.0 * said['battery']:.0f} %",
-        _number(said.get("satellites")),
-        _number(said.get("peers")),
-        "" if not said else styled(str(failed_checks), NOTABLE if failed_checks else ""),
+        "" if reported.get("battery") is None else f"{100.0 * reported['battery']:.0f} %",
+        _number(reported.get("satellites")),
+        _number(reported.get("peers")),
+        "" if not reported else styled(str(failed_checks), NOTABLE if failed_checks else ""),
         styled(f"{round(state.clock_offset_s, 1) + 0.0:+.1f}", "" if clock_well else NOTABLE),
     ]
 
 
 def _notes(state: State) -> list["str | Text"]:
+    from edge.core.counted import counted
+
     notes: list[str | Text] = []
     service, pending = state.overview["service"], state.overview["pending"]
     if pending:
-        notes.append(
-            styled(
-                f"? a switch to {pending[:SHORT]} is not confirmed yet: unless "
-                "somebody deploys, deploy again",
-                NOTABLE,
-            )
-        )
+        note = f"? switch to {pending[:SHORT]} not confirmed: if nobody is deploying, deploy again"
+        notes.append(styled(note, NOTABLE))
     if state.last_words is not None:
         notes.append(styled(state.last_words, BAD))
     if service["restarts"]:
-        notes.append(f"its program was restarted {service['restarts']} times by itself")
+        notes.append(f"systemd restarted its program {counted(service['restarts'], 'time')}")
     return notes
 
 
@@ -181,7 +177,7 @@ def _slot(config: "FleetConfig", robot: str) -> int | None:
 
 
 def _failed(service: Mapping[str, Any]) -> bool:
-    """It is dead, or starts again after it died."""
+    """Whether the program has failed, or is being restarted after it did."""
     died = service["result"] not in ("", "success") or service["restarts"] > 0
     return service["active"] == "failed" or (service["active"] == "activating" and died)
 
@@ -194,13 +190,13 @@ def _parts(versions: Mapping[str, Any] | None) -> str | None:
     return ", ".join(f"{name} {str(versions.get(name))[:SHORT]}" for name in names)
 
 
-def _number_of(state: State) -> int:
-    """Of the robot's release: the greater, the later it was made. It is the Unix time, s."""
+def _release_number(state: State) -> int:
+    """Number of the robot's release: the Unix time when it was made, s."""
     return int(state.overview["number"] or 0)
 
 
 def _date(state: State) -> str:
-    return time.strftime("%Y-%m-%d %H:%M", time.localtime(_number_of(state)))
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(_release_number(state)))
 
 
 def _duration(seconds: float) -> str:

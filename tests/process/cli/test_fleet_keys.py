@@ -49,7 +49,7 @@ def test_an_authority_its_operators_and_who_is_revoked(fleet: Path, tmp_path: Pa
         assert (own.name, own.role) == (name, role)
         assert not (out / "authority.key").exists()
     again = called("fleet", "operator", "bob", "--fleet", fleet, "--out", tmp_path / "bob")
-    assert "is there already: give a new folder" in error_line(again)
+    assert "exists: give a new folder" in error_line(again)
     assert [m["name"] for m in members(fleet)] == ["ann", "bob", "eve"]
 
     assert "members: ann, bob, eve" in error_line(called("fleet", "revoke", "r9", "--fleet", fleet))
@@ -57,7 +57,7 @@ def test_an_authority_its_operators_and_who_is_revoked(fleet: Path, tmp_path: Pa
     assert "add --in-flight" in error_line(called("fleet", "revoke", "bob", "--fleet", fleet))
     assert len(members(fleet)) == 3
     done = called("fleet", "revoke", "bob", "--fleet", fleet, "--in-flight")
-    assert done.returncode == 0 and "bob is no member any more" in done.stdout
+    assert done.returncode == 0 and "bob is no longer a member" in done.stdout
     assert [m["name"] for m in members(fleet)] == ["ann", "eve"]
     table = called("fleet", "members", "--fleet", fleet).stdout
     assert "bob" not in table and "observer" in table and "list 5" in table
@@ -73,4 +73,4 @@ def test_an_insecure_fleet_has_no_keys(fleet: Path) -> None:
 
 def test_one_robots_options_are_not_for_all(fleet: Path) -> None:
     line = error_line(called("fleet", "enroll", "--fleet", fleet, "--user", "voxl"))
-    assert line == "lpac: --user is one robot's: give its name too"
+    assert line == "lpac: --user is for one robot: give its name too"

@@ -154,7 +154,7 @@ def test_who_is_heard_badly_is_named(fleet: ThinAir, station: GroundStation) -> 
     assert answer.returncode == 1
     last = answer.stderr.splitlines()[-1]
     assert last.startswith("lpac: radio: the others hear ") and " of r1" in last
-    assert "arrived, %: a row hears, a column says" in answer.stdout
+    assert "arrived, %: a row receives, a column sends" in answer.stdout
 
 
 # Robots' computers are this machine's shell, with a radio that is busy three tenths of the time.
@@ -238,5 +238,5 @@ def test_robots_of_a_simulated_fleet_have_no_computer_to_load_the_radio_from(
     answer = ask(station, fleet, "--load")
     assert answer.returncode == 1
     assert answer.stderr.splitlines() == [
-        "lpac: --load: the robots are no computers that could send a bulk stream"
+        "lpac: --load: no robot has a computer that could send a bulk stream"
     ]

@@ -360,16 +360,16 @@ def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FleetRig
     rig.start()
     stolen, fleet = f"r{STOLEN}", ("--fleet", rig.fleet.fleet_toml)
     for command, why in (
-        (("revoke", stolen), f"{stolen} was heard in the air last: add --in-flight"),
+        (("revoke", stolen), f"{stolen} was in the air when last heard: add --in-flight"),
         (("revoke", "sim"), "sim commands the fleet: add --in-flight"),
         (("operator", "sim", "--out", rig.fleet.folder / "new"), "and would lose its key"),
-        (("rotate",), "r0, r1 flew when last heard, and would lose this computer's ground"),
+        (("rotate",), "r0, r1: in the air when last heard, and would lose this computer's"),
     ):
         assert why in error_line(lpac("fleet", *command, *fleet))
     assert flies_on(rig.status(0)) and flies_on(rig.status(STOLEN))
     done = lpac("fleet", "revoke", stolen, "--in-flight", *fleet)
     assert done.returncode == 0, done.stderr
-    assert "these keep the list of members that they have" in done.stdout
+    assert "these keep their old list of members" in done.stdout
     # SSH reaches the other one alone.
     give_list(
         Authority(rig.fleet.folder / "keys", rig.fleet.name),

@@ -212,12 +212,12 @@ def test_what_is_not_as_it_should_be_is_noted(
     assert rows[3][2:] == ["01234567", "failed", "+0.0"]
     assert rows[4][2:] == ["none", "none", "+0.0"]
     assert [line.split()[0] for line in notes] == ["r2", "r3", "r4", "r4", "newest"]
-    assert "fedcba98 is not confirmed yet" in notes[0]
+    assert "fedcba98 not confirmed" in notes[0]
     before = date(1796000000 - 60)
     parts = "image 11111111, bundle 22222222, world 44444444"
     assert notes[1].split("*")[1].strip() == f"behind r1: {before}: {parts}"
     assert notes[2].endswith("lpac: no such file")
-    assert "restarted 5 times" in notes[3]
+    assert "systemd restarted its program 5 times" in notes[3]
 
 
 def test_a_configuration_that_was_not_deployed_is_marked(
@@ -231,6 +231,5 @@ def test_a_configuration_that_was_not_deployed_is_marked(
     assert [line.split()[2] for line in table[2:]] == ["01234567*", "01234567"]
     assert [line.split()[0] for line in notes] == ["r1", "all"]
     assert (
-        "its configuration is not the one of fleet.toml: lpac fleet deploy --robots r1"
-        in (notes[0])
+        "its configuration is not that of fleet.toml: lpac fleet deploy --robots r1" in (notes[0])
     )
