@@ -16,7 +16,7 @@ from lpac.radio.airtime import (
     Transport,
     Wifi,
     airtime,
-    carries,
+    capacity,
     link_quality,
 )
 
@@ -116,7 +116,7 @@ def _quality_of(topology: Topology, robots: int, payload: PayloadType) -> str:
 
 def _carried(topology: Topology, payload: PayloadType) -> str:
     traffic = _traffic(1, payload)
-    return str(carries(topology.transport, topology.wifi, traffic, most=MOST))
+    return str(capacity(topology.transport, topology.wifi, traffic, most=MOST))
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

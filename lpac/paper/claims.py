@@ -13,7 +13,7 @@ import numpy as np
 
 from edge.core.counted import counted
 from lpac.analysis.statistics import Interval95
-from lpac.radio.airtime import TRANSPORTS, Traffic, Wifi, carries
+from lpac.radio.airtime import TRANSPORTS, Traffic, Wifi, capacity
 from lpac.study.rates import FIELD as FIELD_TIMING
 from lpac.study.rates import Timing
 from lpac.study.summary import WHOLE_ROBOTS
@@ -354,7 +354,7 @@ def _network(network: Json) -> list[Claim]:
 def _team() -> Claim:
     wifi = Wifi()
     by_transport = ", ".join(
-        f"{transport} {carries(transport, wifi, Traffic(robots=1), most_robots=1000)} robots"
+        f"{transport} {capacity(transport, wifi, Traffic(robots=1), most_robots=1000)} robots"
         for transport in TRANSPORTS
     )
     return Claim(

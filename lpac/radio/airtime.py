@@ -1,19 +1,19 @@
-"""How much of a Wi-Fi channel's time a fleet's messages take, and what becomes of them.
+"""Model of a Wi-Fi channel: airtime, loss and delay of a fleet's messages.
 
-A model, not a measurement; docs/network.md has its figures, and what emulated Wi-Fi said to it. All
-stations hear each other, on one channel, and around one access point:
+docs/network.md has its results, and a comparison with emulated Wi-Fi. All stations share one
+channel and one access point, and hear each other:
 
 - `mesh`: each robot has a TLS connection to each other station. A message crosses the air twice for
   each receiver, station -> access point -> station, and so does TCP's acknowledgement.
-- `multicast`: what robots tell each other goes up once, acknowledged and at the data rate as all
-  that a station sends, and down once for all, at the multicast rate and without acknowledgement.
-  What the ground hears or says goes over TLS, to each robot by itself.
+- `multicast`: a robot's message to the others goes up once, acknowledged and at the data rate, like
+  all that a station sends. It goes down once for all, at the multicast rate and unacknowledged.
+  Messages to and from the ground use one TLS connection per robot.
 
-Per transmission: DIFS, backoff, preamble, data, SIFS and acknowledgement. What goes to one station
-goes as one A-MPDU; and for a robot that sends, all that it has to say goes to the access point,
-whoever it is for. How many slots are idle and how many transmissions collide for each that succeeds
-follows Bianchi, "Performance Analysis of the IEEE 802.11 Distributed Coordination Function" (IEEE
-JSAC 18(3), 2000), with as many contenders as wait in a queue of such a load.
+A transmission consists of DIFS, backoff, preamble, data, SIFS and acknowledgement. Packets to one
+station form one A-MPDU. All packets of a robot go to the access point, so they form one too.
+Idle slots and collisions per successful transmission follow Bianchi, "Performance Analysis of the
+IEEE 802.11 Distributed Coordination Function" (IEEE JSAC 18(3), 2000). The number of contenders is
+that of stations waiting in a queue at this load.
 """
 
 import bisect
@@ -32,36 +32,36 @@ from edge.identity.envelope import HEAD_BYTES
 from edge.identity.group import DATAGRAM_BYTES, PART_BYTES, frames
 from edge.messages.topics import EXPLORED, MESSAGE, STATE, STATUS
 
-# How robots' messages travel, in fleets as in the model.
+# Transport of messages between robots, in fleets and in the model.
 Transport = Literal["mesh", "multicast"]
 TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
 
-# The OFDM PHY at 5 GHz (IEEE 802.11-2020, 17.4.4), us.
+# OFDM PHY at 5 GHz (IEEE 802.11-2020, 17.4.4).
 _SLOT_US, _SIFS_US, _DIFS_US = 9.0, 16.0, 34.0
-# Of 802.11n and later in mixed mode; and of the old rates, in which groups are addressed.
-_PREAMBLE_US, _OLD_PREAMBLE_US = 40.0, 20.0
-# A compressed block acknowledgement: the old preamble, and 32 bytes at 24 Mbit/s.
+# Mixed-mode preamble of 802.11n and later, and legacy preamble, which multicast frames have.
+_PREAMBLE_US, _LEGACY_PREAMBLE_US = 40.0, 20.0
+# A compressed block acknowledgement: the legacy preamble, and 32 bytes at 24 Mbit/s.
 _ACK_US = 32.0
 _LEAST_WINDOW, _DOUBLINGS = 16, 6
 # Attempts at a frame before a station gives up.
 _ATTEMPTS = 8
-# Half of what the standard lets into one A-MPDU, 64 frames and 5.484 ms: a queue is seldom full.
+# Half of the standard's limits for an A-MPDU, 64 frames and 5.484 ms: a queue is seldom full.
 _MOST_FRAMES, _LONGEST_US = 32.0, 2500.0
 # QoS header 26, LLC and SNAP 8, CCMP 16, checksum 4; delimiters of an A-MPDU are left out.
 _MAC_BYTES = 54
 _IP_BYTES, _UDP_BYTES, _MTU_BYTES = 20, 8, 1500
-# With timestamps, as Linux has them.
+# With timestamps, the default of Linux.
 _TCP_IP_BYTES = 52
 # Counted on a connection of two zenoh 1.x sessions, with declared keys.
 _ZENOH_BYTES = 27
 # TLS 1.3: a record's header 5, its type 1, its authentication tag 16.
 _TLS_BYTES = 22
-# TCP acknowledges every second full segment, and within 40 ms what is left; 2.5 messages a second
-# are too few for an acknowledgement to wait for one that goes its way.
+# TCP acknowledges every second full segment, and the rest within 40 ms. At 2.5 messages a second,
+# no acknowledgement can ride on a message in the other direction.
 _SEGMENTS_PER_ACK = 2.0
 
-# What is said, in its envelope (`edge.identity.envelope`): bytes, means of simulated flights of the
-# field policy. A message with its beacon, of ten robots; of 30 in one world it is a tenth more.
+# Sizes in an envelope (`edge.identity.envelope`): means over simulated flights of the field policy.
+# A message with its beacon, with ten robots; with 30 in one world it is a tenth larger.
 MESSAGE_BYTES: Mapping[PayloadType, float] = MappingProxyType(
     {"float32": 2576.0, "float16": 1786.0, "int8": 1206.0}
 )
@@ -69,12 +69,12 @@ EXPLORED_BYTES = 150.0
 
 
 def status_bytes(robots: float) -> float:
-    """Mean size of the RobotStatuses of a robot that hears all of so many."""
+    """Mean size of a RobotStatus where each of `robots` robots hears all others."""
     return 1110.0 + 10.0 * robots
 
 
 def state_bytes(robots: float) -> float:
-    """Size of a GroundState for so many, with an echo of each, but of 32 at most."""
+    """Size of a GroundState for `robots` robots, with an echo of each, at most 32."""
     return 342.0 + 24.0 * min(robots, 32.0)
 
 
@@ -161,7 +161,7 @@ def airtime(transport: Transport, wifi: Wifi, traffic: Traffic) -> Airtime:
     return _airtime(transport, wifi, traffic, traffic.robots)
 
 
-def carries(
+def capacity(
     transport: Transport,
     wifi: Wifi,
     traffic: Traffic,
@@ -169,10 +169,10 @@ def carries(
     most: float = 0.6,
     most_robots: int = 10_000,
 ) -> int:
-    """For how many robots the total is `most` or less, instead of `traffic.robots`; 0 if for none.
+    """Greatest number of robots, up to `most_robots`, whose total airtime is at most `most`.
 
-    No more than `most_robots` are tried. Raises what `airtime` does, and ValueError for a share
-    that is not above 0 and finite.
+    Ignores `traffic.robots`. Raises ValueError for another transport, and unless `most` is finite
+    and above 0.
     """
     require(Transport, transport, "transport")
     require(Positive, most, "most")
@@ -184,16 +184,16 @@ def carries(
 
 
 def link_quality(transport: Transport, wifi: Wifi, traffic: Traffic) -> LinkQuality:
-    """Loss and delay of a robot's message to another: `lpac.sim.medium.Medium` takes the two.
+    """Loss and delay of a robot's message to another, as for `lpac.sim.medium.Medium`.
 
-    A message waits as in a queue of random arrivals and equal jobs (Pollaczek and Khinchine), a job
-    being one message to all its receivers. What waits for one receiver is sent together, which
-    takes less time: so a channel that `airtime` finds full may still carry all, late. If it does
-    not, messages wait `Wifi.queue_s`, and of what is too much for the channel each has the same
-    chance to be dropped. In multicast nothing is sent together, and each of a message's frames is
-    lost for good by noise or by a collision; in a mesh it is repeated, and takes time only.
+    The wait is that of an M/D/1 queue (Pollaczek and Khinchine), in which a job is one message to
+    all its receivers. In a mesh, messages that wait for one receiver are aggregated, which takes
+    less time. So a channel that `airtime` finds full may still carry all messages, late. If it
+    cannot, messages wait `Wifi.queue_s`, and the excess is dropped, each with the same probability.
+    Multicast aggregates nothing, and loses frames by noise and collisions; a mesh repeats them, at
+    the cost of time only.
 
-    Raises what `airtime` does.
+    Raises ValueError for another transport.
     """
     require(Transport, transport, "transport")
     wait_s, load = _queue(transport, wifi, traffic)
@@ -201,13 +201,13 @@ def link_quality(transport: Transport, wifi: Wifi, traffic: Traffic) -> LinkQual
     if transport == "multicast":
         frames = _datagrams(traffic.message_bytes).number
         delivery *= ((1.0 - wifi.frame_loss) * (1.0 - load.collision)) ** frames
-    # The copies come one after another, a group's all at once.
+    # Copies in a mesh arrive one after another, in multicast all at once.
     sending_s = load.message_s * (1.0 if transport == "multicast" else 0.5)
     return LinkQuality(1.0 - delivery, wait_s + min(sending_s, wifi.queue_s))
 
 
-def lost_for_good(transport: Transport, wifi: Wifi, message_bytes: float) -> float:
-    """The share of messages that noise takes on a free channel: where frames are repeated, none."""
+def noise_loss(transport: Transport, wifi: Wifi, message_bytes: float) -> float:
+    """Share of messages lost to noise on a free channel: none in a mesh, which repeats frames."""
     if transport != "multicast":
         return 0.0
     delivered: float = (1.0 - wifi.frame_loss) ** _datagrams(message_bytes).number
@@ -215,39 +215,39 @@ def lost_for_good(transport: Transport, wifi: Wifi, message_bytes: float) -> flo
 
 
 def _queue(transport: Transport, wifi: Wifi, traffic: Traffic) -> tuple[float, Airtime]:
-    """How long messages wait, s, and what they take when those that wait are sent together."""
+    """Mean wait of messages, s, and their airtime with aggregation of those that wait."""
     robots = traffic.robots
     if transport == "multicast":
         load = _airtime(transport, wifi, traffic, robots)
         if not load.message_s:
             return 0.0, load
-        return min(load.message_s * _waiting(load.total), wifi.queue_s), load
-    # How often a message for one station comes to its queue.
+        return min(load.message_s * _mean_wait(load.total), wifi.queue_s), load
+    # Arrival rate of messages in the queue for one station.
     message = _flows(traffic, robots)[0]
-    comes_hz = message.senders * message.rate_hz * message.robots / robots
+    arrivals_hz = message.senders * message.rate_hz * message.robots / robots
 
     def load_after(wait_s: float) -> Airtime:
-        return _airtime(transport, wifi, traffic, robots, 1.0 + comes_hz * wait_s)
+        return _airtime(transport, wifi, traffic, robots, 1.0 + arrivals_hz * wait_s)
 
-    # The longer they wait, the more of them go together, and the less they have to wait.
+    # Bisection: a longer wait aggregates more messages, which shortens the wait.
     low_s, high_s = 0.0, wifi.queue_s
     for _ in range(30):
         wait_s = (low_s + high_s) / 2.0
         load = load_after(wait_s)
-        if load.message_s * _waiting(load.total) > wait_s:
+        if load.message_s * _mean_wait(load.total) > wait_s:
             low_s = wait_s
         else:
             high_s = wait_s
     return high_s, load_after(high_s)
 
 
-def _waiting(load: float) -> float:
-    """How many jobs' time somebody waits who comes at random, in a queue M/D/1."""
+def _mean_wait(load: float) -> float:
+    """Mean wait in an M/D/1 queue, in service times."""
     return load / (2.0 * (1.0 - load)) if load < 1.0 else math.inf
 
 
 class _Packets(NamedTuple):
-    """How many IP packets, and the mean of their bytes."""
+    """Number and mean size of IP packets."""
 
     number: float
     mean_bytes: float
@@ -266,12 +266,12 @@ def _segments(payload_bytes: float) -> _Packets:
 def _datagrams(payload_bytes: float) -> _Packets:
     """Packets of a message in a multicast group."""
     count = frames(payload_bytes)
-    around_bytes = DATAGRAM_BYTES - PART_BYTES + _UDP_BYTES + _IP_BYTES
-    return _Packets(count, (payload_bytes - HEAD_BYTES) / count + around_bytes)
+    header_bytes = DATAGRAM_BYTES - PART_BYTES + _UDP_BYTES + _IP_BYTES
+    return _Packets(count, (payload_bytes - HEAD_BYTES) / count + header_bytes)
 
 
 class _Contention(NamedTuple):
-    """For each transmission that succeeds: idle slots, and collisions; and how likely one is."""
+    """Idle slots and collisions per successful transmission; probability of a collision."""
 
     idle_slots: float
     collisions: float
@@ -280,31 +280,31 @@ class _Contention(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def _contention(contenders: float) -> _Contention:
-    """Bianchi's model of stations that always have something to send, 1 of them or more."""
+    """Bianchi's model of at least one station, each of which always has something to send."""
     low, high = 0.0, 1.0
-    # The probability of a collision that makes stations send as often as it takes to cause it.
+    # Bisection for the collision probability at the model's fixed point.
     for _ in range(50):
         collision = (low + high) / 2.0
-        sending = _sending(collision)
-        if 1.0 - (1.0 - sending) ** (contenders - 1.0) > collision:
+        sends = _sends(collision)
+        if 1.0 - (1.0 - sends) ** (contenders - 1.0) > collision:
             low = collision
         else:
             high = collision
     collision = low
-    sending = _sending(collision)
-    busy = 1.0 - (1.0 - sending) ** contenders
-    alone = contenders * sending * (1.0 - sending) ** (contenders - 1.0)
-    return _Contention((1.0 - busy) / alone, busy / alone - 1.0, collision)
+    sends = _sends(collision)
+    busy = 1.0 - (1.0 - sends) ** contenders
+    success = contenders * sends * (1.0 - sends) ** (contenders - 1.0)
+    return _Contention((1.0 - busy) / success, busy / success - 1.0, collision)
 
 
-def _sending(collision: float) -> float:
-    """The probability that a station sends in a slot: Bianchi's equation 7, without its pole."""
+def _sends(collision: float) -> float:
+    """Probability that a station sends in a slot: Bianchi's equation 7, without its pole."""
     doubled = math.fsum((2.0 * collision) ** stage for stage in range(_DOUBLINGS))
     return 2.0 / (1.0 + _LEAST_WINDOW + collision * _LEAST_WINDOW * doubled)
 
 
 class _Use(NamedTuple):
-    """Of the channel's time, us or shares of it: what stations send, and the access point."""
+    """Channel time, us or shares, of what stations send (`up`) and the access point (`down`)."""
 
     up: float = 0.0
     down: float = 0.0
@@ -321,58 +321,57 @@ class _Use(NamedTuple):
 
 
 class _Channel:
-    """How long transmissions take on a channel that `contenders` want at once.
+    """Durations of transmissions on a channel with `contenders` stations that want to send.
 
-    Where a receiver's messages wait, `together` of them go as one A-MPDU. Without `gaps` only what
-    is sent counts.
+    `aggregated` messages to one receiver form one A-MPDU. Without `gaps`, idle time is left out.
     """
 
     def __init__(
-        self, wifi: Wifi, contenders: float = 1.0, together: float = 1.0, *, gaps: bool = True
+        self, wifi: Wifi, contenders: float = 1.0, aggregated: float = 1.0, *, gaps: bool = True
     ) -> None:
         self._wifi = wifi
         self._contention = _contention(contenders)
-        self._together = together
+        self._aggregated = aggregated
         self._gaps = gaps
 
     @property
     def collision(self) -> float:
-        """How likely a transmission collides."""
+        """Probability that a transmission collides."""
         return self._contention.collision
 
-    def one_sender(self, packets: _Packets, copies: float) -> _Use:
-        """Copies from one station to the access point, which is the next receiver of them all."""
-        return _Use(up=self._to_one(packets, copies) if copies else 0.0)
+    def from_station(self, packets: _Packets, copies: float) -> _Use:
+        """Copies from one station to the access point, for any receivers."""
+        return _Use(up=self._unicast_us(packets, copies) if copies else 0.0)
 
     def to_stations(self, packets: _Packets, copies: float) -> _Use:
         """Copies from the access point, each to another station."""
-        return _Use(down=copies * self._to_one(packets, self._together) / self._together)
+        return _Use(down=copies * self._unicast_us(packets, self._aggregated) / self._aggregated)
 
     def from_stations(self, packets: _Packets, copies: float) -> _Use:
         """Copies to the access point, each from another station."""
-        return _Use(up=copies * self._to_one(packets, self._together) / self._together)
+        return _Use(up=copies * self._unicast_us(packets, self._aggregated) / self._aggregated)
 
     def to_group(self, packets: _Packets) -> _Use:
-        """From the access point: frame by frame, and nobody acknowledges."""
+        """Multicast from the access point, frame by frame, without acknowledgement."""
         data_us = _data_us(packets.mean_bytes, self._wifi.multicast_rate_mbit_s)
-        return _Use(down=packets.number * self._won(_OLD_PREAMBLE_US + data_us))
+        return _Use(down=packets.number * self._exchange_us(_LEGACY_PREAMBLE_US + data_us))
 
-    def _to_one(self, packets: _Packets, copies: float) -> float:
-        """With acknowledgement, and with what is repeated; us."""
+    def _unicast_us(self, packets: _Packets, copies: float) -> float:
+        """Duration of acknowledged transmissions with retries."""
         count = copies * packets.number
         frame_us = _data_us(packets.mean_bytes, self._wifi.data_rate_mbit_s)
         turns = max(1.0, count / _MOST_FRAMES, count * frame_us / _LONGEST_US)
         frames, loss = count / turns, self._wifi.frame_loss
-        each = (1.0 - loss**_ATTEMPTS) / (1.0 - loss)
-        # A turn is repeated until its last frame is through, with only what is missing; unless
-        # more waits, with which that goes.
+        attempts = (1.0 - loss**_ATTEMPTS) / (1.0 - loss)
+        # A turn is repeated with its missing frames until none is missing. Where more messages
+        # wait, the missing frames go with them.
         rounds = math.fsum(1.0 - (1.0 - loss**n) ** frames for n in range(_ATTEMPTS))
-        rounds = each + (rounds - each) / self._together
-        data_us = frames * each * frame_us / rounds
-        return turns * rounds * self._won(_PREAMBLE_US + data_us + _ACK_US, _SIFS_US)
+        rounds = attempts + (rounds - attempts) / self._aggregated
+        data_us = frames * attempts * frame_us / rounds
+        return turns * rounds * self._exchange_us(_PREAMBLE_US + data_us + _ACK_US, _SIFS_US)
 
-    def _won(self, sent_us: float, gap_us: float = 0.0) -> float:
-        """One exchange, with what it takes to get its turn. A collision lasts as long as it."""
+    def _exchange_us(self, sent_us: float, gap_us: float = 0.0) -> float:
+        """Duration of an exchange with its contention. A collision lasts as long as an exchange."""
         idle_slots, collisions, _ = self._contention
         if not self._gaps:
             return (1.0 + collisions) * sent_us
@@ -384,7 +383,7 @@ def _data_us(packet_bytes: float, rate_mbit_s: float) -> float:
 
 
 class _Flow(NamedTuple):
-    """Messages of `senders` on a topic: how often, to how many robots, and if to the ground."""
+    """Messages of `senders` on a topic, each to `robots` robots, and perhaps to the ground."""
 
     topic: str
     source: Literal["robot", "ground"]
@@ -407,27 +406,28 @@ def _flows(traffic: Traffic, robots: int) -> tuple[_Flow, ...]:
 
 
 def _airtime(
-    transport: Transport, wifi: Wifi, traffic: Traffic, robots: int, together: float = 1.0
+    transport: Transport, wifi: Wifi, traffic: Traffic, robots: int, aggregated: float = 1.0
 ) -> Airtime:
     flows = _flows(traffic, robots)
     stations = robots + (1.0 if wifi.ground_wired else 2.0)
-    alone = _Channel(wifi, 1.0, together)
-    contenders = _contenders([_share(transport, wifi, alone, flow) for flow in flows], stations)
-    channel = _Channel(wifi, contenders, together)
+    uncontended = _Channel(wifi, 1.0, aggregated)
+    uses = [_share(transport, wifi, uncontended, flow) for flow in flows]
+    contenders = _contenders(uses, stations)
+    channel = _Channel(wifi, contenders, aggregated)
     shares = {flow.topic: _share(transport, wifi, channel, flow).total for flow in flows}
-    sending = _Channel(wifi, contenders, together, gaps=False)
+    sending = _Channel(wifi, contenders, aggregated, gaps=False)
     busy = math.fsum(_share(transport, wifi, sending, flow).total for flow in flows)
     message_s = 1e-6 * _message_us(transport, wifi, channel, flows[0]).total
     return Airtime(MappingProxyType(shares), busy, message_s, contenders, channel.collision)
 
 
 def _contenders(shares: Sequence[_Use], stations: float) -> float:
-    """How many want to send when somebody does, by what the flows would take if only one did.
+    """Mean number of contenders for a transmission, from the flows' uncontended shares.
 
-    While the channel is busy, all that waits at the access point is one contender. A station that
-    waits does so for the rest of a transmission, half of one on average, and then has to win
-    against those that wait, the access point among them. By Little's law so many wait as come
-    meanwhile.
+    While the channel is busy, the access point is one contender, however much it has to send. A
+    waiting station waits for the rest of a transmission, half of one on average, and then contends
+    with the others and the access point. By Little's law, the number that waits is the number that
+    arrives during a wait.
     """
     up, total = math.fsum(use.up for use in shares), math.fsum(use.total for use in shares)
     if up >= 1.0:
@@ -441,7 +441,7 @@ def _share(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow) -> 
 
 
 def _message_us(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow) -> _Use:
-    """Airtime of one message of a flow, to all that hear it."""
+    """Airtime of one message of a flow to all its receivers."""
     if transport == "multicast" and flow.robots and flow.source != "ground":
         in_group = _multicast_us(wifi, channel, flow)
         if not flow.to_ground:
@@ -456,10 +456,10 @@ def _message_us(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow
 
 
 def _connections_us(channel: _Channel, segments: _Packets, *, up: float, down: float) -> _Use:
-    """One sender's copies, `up` to the access point and `down` from there; acks the other way."""
+    """Copies from one sender, `up` to the access point and `down` from it, and their TCP acks."""
     acks = max(1.0, segments.number / _SEGMENTS_PER_ACK)
     return (
-        channel.one_sender(segments, up)
+        channel.from_station(segments, up)
         .plus(channel.to_stations(segments, down))
         .plus(channel.from_stations(_TCP_ACK, acks * down))
         .plus(channel.to_stations(_TCP_ACK, acks * up))
@@ -468,5 +468,5 @@ def _connections_us(channel: _Channel, segments: _Packets, *, up: float, down: f
 
 def _multicast_us(wifi: Wifi, channel: _Channel, flow: _Flow) -> _Use:
     datagrams = _datagrams(flow.payload_bytes)
-    up = channel.one_sender(datagrams, 1.0 if flow.source == "robot" else 0.0)
+    up = channel.from_station(datagrams, 1.0 if flow.source == "robot" else 0.0)
     return up.plus(channel.to_group(datagrams))

@@ -5,7 +5,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from lpac.radio.airtime import Traffic, Transport, Wifi, lost_for_good
+from lpac.radio.airtime import Traffic, Transport, Wifi, noise_loss
 from lpac.radio.pairs import Pair, Window, pairs
 from lpac.radio.records import RadioRecord
 
@@ -59,7 +59,7 @@ class Checked(NamedTuple):
         traffic = self.traffic
         if traffic is None:
             return 0.0
-        return lost_for_good(self.transport, Wifi(), traffic.message_bytes)
+        return noise_loss(self.transport, Wifi(), traffic.message_bytes)
 
     def pairs(self) -> tuple[Pair, ...]:
         """Pairs of the judged robots."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from edge.core.counted import counted
 from edge.messages.mission import RobotStatus
-from lpac.radio.airtime import Wifi, airtime, carries
+from lpac.radio.airtime import Wifi, airtime, capacity
 from lpac.radio.checked import Checked, WifiReading
 from lpac.radio.pairs import LATE_S, Pair, blame
 
@@ -228,7 +228,7 @@ def _room(checked: Checked) -> Room | None:
     most = MOST_BUSY - others
     return Room(
         robots=traffic.robots,
-        carries=(carries(checked.transport, wifi, flight, most=most / scale) if most > 0.0 else 0),
+        carries=(capacity(checked.transport, wifi, flight, most=most / scale) if most > 0.0 else 0),
         ground_share=scale * ground.total,
         flight_share=scale * airtime(checked.transport, wifi, flight).total,
         rate_mbit_s=rate_mbit_s,

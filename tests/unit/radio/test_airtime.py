@@ -25,7 +25,7 @@ from lpac.radio.airtime import (
     Transport,
     Wifi,
     airtime,
-    carries,
+    capacity,
     link_quality,
     state_bytes,
     status_bytes,
@@ -194,7 +194,7 @@ def test_loss_and_delay_are_bounded(transport: Transport, wifi: Wifi, traffic: T
 def test_carries_is_the_last_that_fits(
     transport: Transport, wifi: Wifi, traffic: Traffic, most: float
 ) -> None:
-    robots = carries(transport, wifi, traffic, most=most, most_robots=500)
+    robots = capacity(transport, wifi, traffic, most=most, most_robots=500)
     assert 0 <= robots <= 500
     if robots:
         assert total(transport, wifi, replace(traffic, robots=robots)) <= most
@@ -275,7 +275,7 @@ def test_impossible_questions_are_named() -> None:
     with pytest.raises(ValueError, match=r"^transport = 'pigeon': allowed are 'mesh', 'multicast'"):
         airtime(unknown, WIFI, TEN)
     with pytest.raises(ValueError, match=r"^most = 0\.0: must be above 0"):
-        carries("mesh", WIFI, TEN, most=0.0)
+        capacity("mesh", WIFI, TEN, most=0.0)
 
 
 # The sizes are those of real messages

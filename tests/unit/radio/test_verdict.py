@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.messages.mission import Origin, RadioCounts, RobotStatus
-from lpac.radio.airtime import Traffic, Transport, Wifi, airtime, carries
+from lpac.radio.airtime import Traffic, Transport, Wifi, airtime, capacity
 from lpac.radio.checked import Checked, WifiReading
 from lpac.radio.pairs import Pair, Window
 from lpac.radio.records import RadioRecord
@@ -48,7 +48,7 @@ def wifi(**changes: float | None) -> dict[str, WifiReading]:
 
 def test_a_fleet_that_hears_itself_well() -> None:
     traffic = Traffic(robots=N, message_bytes=BYTES + 85, message_hz=2.5)
-    most = carries("mesh", Wifi(), traffic)
+    most = capacity("mesh", Wifi(), traffic)
     told = verdict(checked(), heard())
     assert told.problems == ()
     assert told.sentence == f"carries 10 robots; by the model there is room for {most - N} more"
