@@ -1,5 +1,5 @@
 """Builds the documentation site: the repository's pages, and reference pages from the code.
 
-`python -m handbook` builds it. `pages` gathers all pages; `commands`, `configuration`, `messages`
-and `interfaces` generate the reference.
+`python -m handbook` builds it. `pages` gathers all pages; `commands`, `configuration`,
+`faults`, `interfaces` and `messages` generate the reference.
 """

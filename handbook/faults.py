@@ -1,7 +1,6 @@
-"""`python -m handbook.faults`: print the drill's tables of docs/faults.md."""
+"""Generates the reference of the drill's faults and bounds."""
 
 import math
-import sys
 from collections.abc import Sequence
 from itertools import groupby, takewhile
 
@@ -38,10 +37,21 @@ _SHORT = {
     "flown beyond the fence": "flown outside",
     "setpoints after the lapse": "setpoints",
 }
+_READING = """\
+A fault hits one robot unless it says all. *M*: mavlink flies it too. *P*: px4 too. Bounds hold for
+the robots hit unless they name others; *next* is the robot after them. Bounds are on true values in
+s, m and m/s. Time counts from the fault or "after" a later event; [2-5] is a window in s.
+[Names](#bounds-by-name) stand for bounds that many faults share.
+
+*mission*: share of the window in which it flies the mission. *ends*, *left*: its last mission
+setpoint, counted from the fault or from 2 m below its height. *rests*: speed in hold. *strays*:
+distance from where it held. *drift*: distance while landing. *pad*: touchdown from its own pad.
+*apart*: distance between landed robots. *height*: off its own. *outside*: how far beyond the fence
+the fault may carry it. *flown outside*: time there."""
 
 
-def tables() -> dict[str, str]:
-    """The drill's tables as Markdown, by topic."""
+def page() -> str:
+    """Reference of the faults, their promises and the bounds by which a flight is judged."""
     shared = ((f"`{name}`", _text(bounds)) for name, bounds in SHARED_BOUNDS.items())
     adrift = f"outside ≤{ADRIFT_M:.3g}; not covered: {ADRIFT}"
     faults = (
@@ -52,11 +62,21 @@ def tables() -> dict[str, str]:
         )
         for fault in FAULTS.values()
     )
-    return {
-        "every flight": table(("in every flight", "limit"), _of_every_flight()),
-        "shared": table(("code", "bounds"), (*shared, ("`adrift`", adrift))),
-        "faults": table(("fault", "what happens, *promise*", "bounds"), faults),
-    }
+    return "\n\n".join(
+        [
+            "# Faults of the drill",
+            "[The drill](../drill.md) flies these faults. Declared in "
+            "[`faults.py`](../../lpac/sim/drill/faults.py); `lpac drill --list` prints them "
+            "without bounds.",
+            "## In every flight",
+            table(("figure", "limit"), _of_every_flight()),
+            "## By fault",
+            _READING,
+            table(("fault", "what happens, *promise*", "bounds"), faults),
+            "## Bounds by name",
+            table(("name", "bounds"), (*shared, ("`adrift`", adrift))),
+        ]
+    )
 
 
 def _engines(fault: Fault) -> str:
@@ -143,7 +163,3 @@ def _bound_text(bound: Bound) -> str:
     if begins or ends < math.inf:
         window = f" [{begins:g}-{ends:g}]" if ends < math.inf else f" [{begins:g}-]"
     return limit + window + (f" after {bound.after}" if bound.after else "")
-
-
-if __name__ == "__main__":
-    sys.stdout.write("\n\n".join(tables().values()) + "\n")

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from handbook import commands, configuration, interfaces, messages
+from handbook import commands, configuration, faults, interfaces, messages
 
 ROOT = Path(__file__).resolve().parent.parent
 # Pages outside of docs/. Files that are linked from pages are added.
@@ -25,6 +25,7 @@ _GENERATED: dict[str, Callable[[], str]] = {
     "docs/reference/study.md": configuration.study,
     "docs/reference/ablation.md": configuration.ablation,
     "docs/reference/messages.md": messages.page,
+    "docs/reference/faults.md": faults.page,
     "docs/reference/manifest.md": configuration.manifest,
     "docs/reference/api.md": interfaces.python_api,
     "docs/reference/interfaces.md": interfaces.page,

@@ -2260,8 +2260,9 @@ MEND = "its table of transitions must be what test_flight.table() returns, row b
 def table() -> list[str]:
     """The machine as rows of Markdown, in the order of `TRANSITIONS`.
 
-    From, to, when, and what the operator reads: that is from the scenarios, with numbers as "…".
-    The states of which all four appear together are "flying".
+    From, to, when, and an example of what the operator reads, from the scenarios, with numbers as
+    "…": empty if `when` has these words, or the row above them. The states of which all four appear
+    together are "flying".
     """
     rows, above = [], ""
     reasons = reasons_by_row()
@@ -2269,9 +2270,10 @@ def table() -> list[str]:
         everywhere = set(row.sources) == set(FlightState)
         sources = "any" if everywhere else ", ".join(state.name for state in row.sources)
         sources = sources.replace("TAKEOFF, HOLD, MISSION, RETURN", "flying")
-        said = "; ".join(sorted(reasons[row.when, row.target]))
-        said, above = ("as above" if said == above else said), said
-        rows.append(f"| {sources} | {row.target.name} | {row.when} | {said} |")
+        said = min(reasons[row.when, row.target])
+        shown = "" if said in row.when or said == above else said
+        above = said
+        rows.append(f"| {sources} | {row.target.name} | {row.when} | {shown} |")
     return rows
 
 

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from handbook.faults import page
 from lpac.analysis.flight import FaultRecord, FlightRecord
 from lpac.analysis.truth import TrueTrack
 from lpac.sim.description import ERRORS, fence_around
@@ -21,7 +22,7 @@ from tests.conftest import ROOT
 def test_the_table_tells_who_flies_what() -> None:
     rows = re.findall(
         r"^\| ([a-z0-9-]+)(?: (M?)(P?))? \| .*<br>.* \| .* \|$",
-        (ROOT / "docs" / "faults.md").read_text(),
+        page(),
         re.MULTILINE,
     )
     assert rows == [
