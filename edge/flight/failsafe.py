@@ -10,7 +10,7 @@ No parameter controls the action on a lost position.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -97,8 +97,9 @@ class Requirement:
 
     name: str
     value_to_set: int | float | None
-    why: str
     values: tuple[int, ...] = ()
+    _: KW_ONLY
+    why: str
     above: float = math.inf
     up_to: float = math.inf
     means: Mapping[int, str] = field(default_factory=dict)
@@ -145,227 +146,86 @@ def required(
     require(RemoteControl, rc, "rc")
     require(Positive, ceiling_m, "ceiling_m")
     require(CommandTimeout, command_timeout_s, "command_timeout_s")
+    meet = "robots that return meet"
+    would_meet = "returning robots would meet"
     return (
-        Requirement(
-            "COM_OF_LOSS_T",
-            1.0,
-            "s without a command until PX4 takes over; the watchdog, which holds a robot that "
-            "hangs, comes first",
-            above=command_timeout_s + 0.2,
-            up_to=1.5,
-        ),
-        Requirement(
-            "COM_OBL_RC_ACT",
-            4,
-            "a robot whose program died must land where it is; robots that return meet",
-            values=(4,),
-            means=_OFFBOARD_LOSS,
-        ),
-        Requirement(
-            "COM_FAIL_ACT_T",
-            5.0,
-            "s of hold before PX4 acts, in which sticks do not take over and the battery drains",
-            above=0.1,
-            up_to=10.0,
-        ),
-        Requirement(
-            "NAV_RCL_ACT",
-            3,
-            "a robot that lost its remote control must stay where it is; robots that return meet",
-            values=(3, 1),
-            means=_LINK_LOSS,
-        ),
+        Requirement("COM_OF_LOSS_T", 1.0, above=command_timeout_s + 0.2, up_to=1.5,
+                    why="s without a command until PX4 takes over; the watchdog, which holds a "
+                    "robot that hangs, comes first"),
+        Requirement("COM_OBL_RC_ACT", 4, (4,), means=_OFFBOARD_LOSS,
+                    why=f"a robot whose program died must land where it is; {meet}"),
+        Requirement("COM_FAIL_ACT_T", 5.0, above=0.1, up_to=10.0,
+                    why="s of hold before PX4 acts, in which sticks do not take over and the "
+                    "battery drains"),
+        Requirement("NAV_RCL_ACT", 3, (3, 1), means=_LINK_LOSS,
+                    why=f"a robot that lost its remote control must stay where it is; {meet}"),
         *_remote_control(rc),
-        Requirement(
-            "NAV_DLL_ACT",
-            0,
-            "PX4 must not act on a MAVLink ground station; the fleet's ground is none",
-            values=(0,),
-            means=_LINK_LOSS,
-        ),
-        Requirement(
-            "GF_ACTION",
-            2,
-            "PX4's fence is the second line, and robots that return meet",
-            values=(2, 5),
-            means=_FENCE,
-        ),
-        Requirement(
-            "GF_MAX_HOR_DIST",
-            0.0,
-            "m from where it was armed: that circle may cut through the fence",
-            values=(0,),
-            means={0: "off"},
-        ),
-        Requirement(
-            "GF_MAX_VER_DIST",
-            0.0,
-            f"m above where it was armed, clear of the ceiling of {ceiling_m:g} m",
-            values=(0,),
-            above=ceiling_m + _CEILING_MARGIN_M,
-            means={0: "off"},
-        ),
-        Requirement(
-            "COM_LOW_BAT_ACT",
-            2,
-            "with a critical battery a robot must land where it is; robots that return meet",
-            values=(2,),
-            means=_BATTERY,
-        ),
-        Requirement(
-            "BAT_LOW_THR",
-            0.15,
-            "share of the battery below which PX4 warns",
-            above=0.1,
-            up_to=0.5,
-        ),
-        Requirement(
-            "BAT_CRIT_THR",
-            0.07,
-            "share of the battery below which PX4 acts; a landing must fit into it",
-            above=0.045,
-            up_to=0.4,
-        ),
-        Requirement(
-            "BAT_EMERGEN_THR",
-            0.05,
-            "share of the battery that is PX4's last resort",
-            above=0.02,
-            up_to=0.3,
-        ),
-        Requirement(
-            "COM_POS_LOW_ACT",
-            2,
-            "what PX4 does in hold when its position gets poor; returning robots would meet",
-            values=(2, 1, 0, 5),
-            means=_FENCE,
-            may_be_absent=True,
-        ),
-        Requirement(
-            "COM_ACT_FAIL_ACT",
-            2,
-            "with a motor that fails a robot must land where it is; robots that return meet",
-            values=(2, 1, 0),
-            means=_MOTOR_FAILURE,
-        ),
-        Requirement(
-            "COM_IMB_PROP_ACT",
-            0,
-            "what PX4 does when a propeller shakes the vehicle; returning robots would meet",
-            values=(0, 2, -1),
-            means=_PROPELLER,
-        ),
-        Requirement(
-            "NAV_TRAFF_AVOID",
-            1,
-            "what PX4 does when an ADS-B receiver reports traffic; returning robots would meet",
-            values=(1, 0, 4, 3),
-            means=_TRAFFIC,
-            may_be_absent=True,
-        ),
-        Requirement(
-            "COM_WIND_MAX_ACT",
-            0,
-            "what PX4 does in a strong wind; returning robots would meet",
-            values=(0, 1, 2, 5),
-            means=_FENCE,
-            may_be_absent=True,
-        ),
-        Requirement(
-            "COM_FLTT_LOW_ACT",
-            1,
-            "robots that return because the battery would just last meet",
-            values=(1, 0),
-            means=_REMAINING_TIME,
-            may_be_absent=True,
-        ),
-        Requirement(
-            "COM_FLT_TIME_MAX",
-            -1,
-            "s of flight after which PX4 returns; robots that return meet",
-            values=(-1, 0),
-            means={-1: "never"},
-            may_be_absent=True,
-        ),
-        Requirement(
-            "COM_DISARM_LAND",
-            2.0,
-            "s from a landing until the motors stop, late enough to be reported; 0 or less "
-            "is never",
-            above=0.5,
-            up_to=5.0,
-        ),
-        Requirement(
-            "COM_DISARM_PRFLT",
-            10.0,
-            "s armed on the ground until the motors stop; 0 or less is never",
-            above=0.0,
-            up_to=20.0,
-        ),
-        Requirement(
-            "COM_ARM_ON_BOOT",
-            0,
-            "nothing but an order may start the motors",
-            values=(0,),
-            means={1: "PX4 arms by itself after power-up"},
-            may_be_absent=True,
-        ),
-        Requirement(
-            "CBRK_FLIGHTTERM",
-            121212,
-            "with any other value PX4 may stop the motors in the air",
-            values=(121212,),
-        ),
-        Requirement(
-            GPS_CONTROL,
-            7,
-            "the position comes from the GPS receiver; a robot has PX4 ignore one that contradicts "
-            "itself, and sets it back",
-            values=(7, 5, 13, 15),
-        ),
-        Requirement(
-            "EKF2_HGT_REF",
-            None,
-            "outdoors a height comes from nothing else; set it by hand, and reboot the autopilot",
-            values=(1, 0),
-            means=_HEIGHT,
-        ),
-    )
+        Requirement("NAV_DLL_ACT", 0, (0,), means=_LINK_LOSS,
+                    why="PX4 must not act on a MAVLink ground station; the fleet's ground is none"),
+        Requirement("GF_ACTION", 2, (2, 5), means=_FENCE,
+                    why=f"PX4's fence is the second line, and {meet}"),
+        Requirement("GF_MAX_HOR_DIST", 0.0, (0,), means={0: "off"},
+                    why="m from where it was armed: that circle may cut through the fence"),
+        Requirement("GF_MAX_VER_DIST", 0.0, (0,), above=ceiling_m + _CEILING_MARGIN_M,
+                    means={0: "off"},
+                    why=f"m above where it was armed, clear of the ceiling of {ceiling_m:g} m"),
+        Requirement("COM_LOW_BAT_ACT", 2, (2,), means=_BATTERY,
+                    why=f"with a critical battery a robot must land where it is; {meet}"),
+        Requirement("BAT_LOW_THR", 0.15, above=0.1, up_to=0.5,
+                    why="share of the battery below which PX4 warns"),
+        Requirement("BAT_CRIT_THR", 0.07, above=0.045, up_to=0.4,
+                    why="share of the battery below which PX4 acts; a landing must fit into it"),
+        Requirement("BAT_EMERGEN_THR", 0.05, above=0.02, up_to=0.3,
+                    why="share of the battery that is PX4's last resort"),
+        Requirement("COM_POS_LOW_ACT", 2, (2, 1, 0, 5), means=_FENCE, may_be_absent=True,
+                    why=f"what PX4 does in hold when its position gets poor; {would_meet}"),
+        Requirement("COM_ACT_FAIL_ACT", 2, (2, 1, 0), means=_MOTOR_FAILURE,
+                    why=f"with a motor that fails a robot must land where it is; {meet}"),
+        Requirement("COM_IMB_PROP_ACT", 0, (0, 2, -1), means=_PROPELLER,
+                    why=f"what PX4 does when a propeller shakes the vehicle; {would_meet}"),
+        Requirement("NAV_TRAFF_AVOID", 1, (1, 0, 4, 3), means=_TRAFFIC, may_be_absent=True,
+                    why=f"what PX4 does when an ADS-B receiver reports traffic; {would_meet}"),
+        Requirement("COM_WIND_MAX_ACT", 0, (0, 1, 2, 5), means=_FENCE, may_be_absent=True,
+                    why=f"what PX4 does in a strong wind; {would_meet}"),
+        Requirement("COM_FLTT_LOW_ACT", 1, (1, 0), means=_REMAINING_TIME, may_be_absent=True,
+                    why="robots that return because the battery would just last meet"),
+        Requirement("COM_FLT_TIME_MAX", -1, (-1, 0), means={-1: "never"}, may_be_absent=True,
+                    why=f"s of flight after which PX4 returns; {meet}"),
+        Requirement("COM_DISARM_LAND", 2.0, above=0.5, up_to=5.0,
+                    why="s from a landing until the motors stop, late enough to be reported; "
+                    "0 or less is never"),
+        Requirement("COM_DISARM_PRFLT", 10.0, above=0.0, up_to=20.0,
+                    why="s armed on the ground until the motors stop; 0 or less is never"),
+        Requirement("COM_ARM_ON_BOOT", 0, (0,), may_be_absent=True,
+                    means={1: "PX4 arms by itself after power-up"},
+                    why="nothing but an order may start the motors"),
+        Requirement("CBRK_FLIGHTTERM", 121212, (121212,),
+                    why="with any other value PX4 may stop the motors in the air"),
+        Requirement(GPS_CONTROL, 7, (7, 5, 13, 15),
+                    why="the position comes from the GPS receiver; a robot has PX4 ignore one that "
+                    "contradicts itself, and sets it back"),
+        Requirement("EKF2_HGT_REF", None, (1, 0), means=_HEIGHT,
+                    why="outdoors a height comes from nothing else; set it by hand, and reboot the "
+                    "autopilot"),
+    )  # fmt: skip
 
 
 def _remote_control(rc: RemoteControl) -> tuple[Requirement, ...]:
     if rc == "none":
         return (
-            Requirement(
-                "COM_RC_IN_MODE",
-                4,
-                "nobody has a remote control: PX4 must not miss one, nor obey a stray one",
-                values=(4,),
-                means=_REMOTE_CONTROL,
-            ),
-        )
+            Requirement("COM_RC_IN_MODE", 4, (4,), means=_REMOTE_CONTROL,
+                        why="nobody has a remote control: PX4 must not miss one, nor obey a stray "
+                        "one"),
+        )  # fmt: skip
     return (
-        Requirement(
-            "COM_RC_IN_MODE",
-            0,
-            "the pilot's remote control must be what PX4 obeys",
-            values=(0,),
-            means=_REMOTE_CONTROL,
-        ),
-        Requirement(
-            "COM_RCL_EXCEPT",
-            4,
-            "a lost remote control must not end a mission (4), and need not end a hold (6)",
-            values=(4, 6),
-        ),
-        Requirement(
-            "COM_RC_OVERRIDE",
-            3,
-            "moving the sticks must give the pilot the vehicle at once",
-            values=(3,),
-            means=_OVERRIDE,
-        ),
-    )
+        Requirement("COM_RC_IN_MODE", 0, (0,), means=_REMOTE_CONTROL,
+                    why="the pilot's remote control must be what PX4 obeys"),
+        Requirement("COM_RCL_EXCEPT", 4, (4, 6),
+                    why="a lost remote control must not end a mission (4), and need not end a hold "
+                    "(6)"),
+        Requirement("COM_RC_OVERRIDE", 3, (3,), means=_OVERRIDE,
+                    why="moving the sticks must give the pilot the vehicle at once"),
+    )  # fmt: skip
 
 
 # All parameters used by `check` and `explain`, to read from the vehicle.
