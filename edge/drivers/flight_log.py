@@ -97,18 +97,21 @@ class FlightMetadata:
         return f"robot-{self.robot_id}"
 
 
+_Convert = Callable[[int, Mapping[str, Any]], Mapping[str, object]]
+
+
 class LoggedTopic(NamedTuple):
     """JSON schema of a topic's messages, and `convert`, called with time in ns and message."""
 
     schema_name: str
     schema: bytes
-    convert: Callable[[int, Mapping[str, Any]], Mapping[str, object]]
+    convert: _Convert
 
 
-def topic(name: str, kind: type, /, **more: Any) -> LoggedTopic:
+def topic(name: str, kind: type | None = None, /, **more: Any) -> LoggedTopic:
     """Topic of messages with the fields of the dataclass `kind`, and `more` (name -> type)."""
-    hints = {**typing.get_type_hints(kind), **more}
-    return _topic(name, _fields_schema(hints))
+    hints = {} if kind is None else typing.get_type_hints(kind)
+    return _topic(f"lpac.{name}", _unchanged, **hints, **more)
 
 
 class FlightLog:
@@ -481,56 +484,51 @@ def _base64(data: bytes) -> str:
 
 # Foxglove needs one type for each value, though unknown values are null.
 _Schema = dict[str, Any]
-_NUMBER: _Schema = {"type": "number"}
-_INTEGER: _Schema = {"type": "integer"}
-_STRING: _Schema = {"type": "string"}
-_BOOLEAN: _Schema = {"type": "boolean"}
 _BASE64: _Schema = {"type": "string", "contentEncoding": "base64"}
-
-
-def _list(items: _Schema) -> _Schema:
-    return {"type": "array", "items": items}
-
-
-def _object(**properties: _Schema) -> _Schema:
-    return {"type": "object", "properties": properties}
-
-
-_ARRAY = _object(dtype=_STRING, shape=_list(_INTEGER), data=_BASE64)
-_BYTES = _object(base64=_BASE64)
-_TIME: _Schema = {**_object(sec=_INTEGER, nsec=_INTEGER), "title": "time"}
-_VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+_BY_TYPE: dict[Any, _Schema] = {
+    float: {"type": "number"},
+    int: {"type": "integer"},
+    str: {"type": "string"},
+    bool: {"type": "boolean"},
+    object: {"type": "object", "properties": {}},
+}
 
 
 def _schema(hint: Any) -> _Schema:
-    """Schema of values of that type after `_plain`."""
+    """Schema of values of that type after `_plain`, or the given schema."""
+    if isinstance(hint, dict):
+        return hint
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
         (known,) = (argument for argument in arguments if argument is not types.NoneType)
         return _schema(known)
     if origin is tuple:
-        return _list(_schema(arguments[0]))
+        return {"type": "array", "items": _schema(arguments[0])}
     if origin is dict:
         return {**_object(), "additionalProperties": _schema(arguments[1])}
     if origin is Literal or issubclass(hint, StrEnum):
-        return _STRING
-    by_type = {float: _NUMBER, int: _INTEGER, str: _STRING, bool: _BOOLEAN}
-    if hint in by_type:
-        return by_type[hint]
-    return _fields_schema(typing.get_type_hints(hint))
+        return _schema(str)
+    return _BY_TYPE.get(hint) or _object(**typing.get_type_hints(hint))
 
 
-def _fields_schema(hints: Mapping[str, Any]) -> _Schema:
+def _object(**hints: Any) -> _Schema:
     """Schema of an object, without lists of lists: Foxglove refuses these, but shows the values."""
     schemas = {name: _schema(hint) for name, hint in hints.items()}
-    return _object(
-        **{
-            name: schema
-            for name, schema in schemas.items()
-            if schema["type"] != "array" or schema["items"]["type"] != "array"
-        }
-    )
+    properties = {
+        name: schema
+        for name, schema in schemas.items()
+        if schema["type"] != "array" or schema["items"]["type"] != "array"
+    }
+    return {"type": "object", "properties": properties}
+
+
+_BY_TYPE[np.ndarray] = _object(dtype=str, shape=tuple[int, ...], data=_BASE64)
+_BY_TYPE[bytes] = _object(base64=_BASE64)
+_TIME = {**_object(sec=int, nsec=int), "title": "time"}
+_POSE = _object(
+    position=_object(**dict.fromkeys("xyz", float)),
+    orientation=_object(**dict.fromkeys("xyzw", float)),
+)
 
 
 def _unchanged(_: int, message: Mapping[str, object]) -> Mapping[str, object]:
@@ -567,76 +565,35 @@ def _foxglove_time(time_ns: int) -> dict[str, int]:
     return dict(zip(("sec", "nsec"), divmod(time_ns, 10**9), strict=True))
 
 
-def _topic(name: str, schema: _Schema) -> LoggedTopic:
-    return LoggedTopic(f"lpac.{name}", json.dumps(schema).encode(), _unchanged)
+def _topic(schema_name: str, convert: _Convert, /, **hints: Any) -> LoggedTopic:
+    return LoggedTopic(schema_name, json.dumps(_object(**hints)).encode(), convert)
 
 
+_Numbers = tuple[float, ...]
 ROBOT_TOPICS = {
-    "perception": _topic(
-        "Perception", _object(images=_ARRAY, position_feature=_ARRAY, features=_ARRAY)
+    "perception": topic(
+        "Perception", images=np.ndarray, position_feature=np.ndarray, features=np.ndarray
     ),
-    "policy": _topic(
-        "Policy",
-        _object(
-            features=_ARRAY,
-            senders=_list(_INTEGER),
-            payloads=_list(_ARRAY),
-            degree=_INTEGER,
-            velocity=_ARRAY,
-            message=_BYTES,
-        ),
+    "policy": topic(
+        "Policy", features=np.ndarray, senders=tuple[int, ...], payloads=tuple[np.ndarray, ...],
+        degree=int, velocity=np.ndarray, message=bytes,
     ),
-    "received": _topic(
-        "Received",
-        _object(sender=_INTEGER, sequence=_INTEGER, age_s=_NUMBER, rejection=_STRING),
+    "received": topic("Received", sender=int, sequence=int, age_s=float, rejection=str),
+    "control": topic(
+        "Control", state=str, reason=str, reason_code=str, height_m=float, position_m=_Numbers,
+        velocity_m_s=_Numbers, policy_velocity_m_s=_Numbers, setpoint_kind=str, setpoint=_Numbers,
+        sent_local=_Numbers, actions=tuple[str, ...], closest_m=float,
     ),
-    "control": _topic(
-        "Control",
-        _object(
-            state=_STRING,
-            reason=_STRING,
-            reason_code=_STRING,
-            height_m=_NUMBER,
-            position_m=_list(_NUMBER),
-            velocity_m_s=_list(_NUMBER),
-            policy_velocity_m_s=_list(_NUMBER),
-            setpoint_kind=_STRING,
-            setpoint=_list(_NUMBER),
-            sent_local=_list(_NUMBER),
-            actions=_list(_STRING),
-            closest_m=_NUMBER,
-        ),
-    ),
-    "flight": _topic(
-        "Flight", _object(number=_INTEGER, whole=_BOOLEAN, given=_object(), made=_object())
-    ),
+    "flight": topic("Flight", number=int, whole=bool, given=object, made=object),
     "status": topic("Status", RobotStatus),
     "order": topic("Order", Order, answer=OrderResult),
     "ground": topic("Ground", GroundState),
     "vehicle": topic("Vehicle", VehicleState),
-    "/pose": LoggedTopic(
-        "foxglove.PoseInFrame",
-        json.dumps(
-            _object(
-                timestamp=_TIME,
-                frame_id=_STRING,
-                pose=_object(position=_VECTOR, orientation=_QUATERNION),
-            )
-        ).encode(),
-        _foxglove_pose,
+    "/pose": _topic(
+        "foxglove.PoseInFrame", _foxglove_pose, timestamp=_TIME, frame_id=str, pose=_POSE
     ),
-    "/log": LoggedTopic(
-        "foxglove.Log",
-        json.dumps(
-            _object(
-                timestamp=_TIME,
-                level=_INTEGER,
-                message=_STRING,
-                name=_STRING,
-                file=_STRING,
-                line=_INTEGER,
-            )
-        ).encode(),
-        _foxglove_log,
+    "/log": _topic(
+        "foxglove.Log", _foxglove_log,
+        timestamp=_TIME, level=int, message=str, name=str, file=str, line=int,
     ),
-}
+}  # fmt: skip
