@@ -7,9 +7,10 @@ import numpy as np
 from edge.core import F32, F64
 from edge.core.memory import RobotMap, RobotMemory
 from edge.core.perception import PerceptionParameters, window_corner
-from edge.core.world import random_features, rasterize
+from edge.core.world import rasterize
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.family import Observation, Policy
+from lpac.analysis.worlds import random_features
 
 NEIGHBOURS = 10
 # Robots fly straight paths of this many views, and end within range of each other.

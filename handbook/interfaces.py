@@ -24,7 +24,8 @@ _INTERFACES = {
     "A sensor": {
         "edge.core.ports": "SensorDriver SensorSetting SensorOver Sensor Camera Look",
         "edge.core.perception": "PerceptionParameters window_corner part_in_world",
-        "edge.core.world": "format_world Feature",
+        "edge.core.world": "Feature",
+        "lpac.analysis.worlds": "format_world",
         "edge.drivers.world_sensor": "world_sensor",
     },
     "A policy": {

@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from edge.core.world import GaussianFeature as GaussianFeature
     from edge.core.world import PolygonFeature as PolygonFeature
     from edge.core.world import parse_world as parse_world
-    from edge.core.world import random_features as random_features
     from edge.core.world import rasterize as rasterize
     from edge.drivers.registry import load_policy as load_policy
     from edge.drivers.world_sensor import WorldSensor as WorldSensor
@@ -81,6 +80,7 @@ if TYPE_CHECKING:
     from lpac.analysis.flight import RobotRecord as RobotRecord
     from lpac.analysis.statistics import VERDICT_RULE as VERDICT_RULE
     from lpac.analysis.statistics import what_would_tell as what_would_tell
+    from lpac.analysis.worlds import random_features as random_features
     from lpac.shipped import SHIPPED_BUNDLE as SHIPPED_BUNDLE
     from lpac.sim.batch import fly_batch as fly_batch
     from lpac.sim.cores import in_this_process as in_this_process
@@ -112,7 +112,7 @@ if TYPE_CHECKING:
 _TAKEN = {
     "edge.core.frames": "ModelScale",
     "edge.core.ports": "Odometry",
-    "edge.core.world": "GaussianFeature PolygonFeature parse_world random_features rasterize",
+    "edge.core.world": "GaussianFeature PolygonFeature parse_world rasterize",
     "edge.drivers.registry": "load_policy",
     "edge.drivers.world_sensor": "WorldSensor",
     "edge.policy.bundle": "Bundle BundleError load_bundle",
@@ -126,6 +126,7 @@ _TAKEN = {
     "lpac.analysis.flight": "FlightRecord RobotRecord",
     "lpac.analysis.examination": "Examined Wanted examine",
     "lpac.analysis.statistics": "VERDICT_RULE what_would_tell",
+    "lpac.analysis.worlds": "random_features",
     "lpac.shipped": "SHIPPED_BUNDLE",
     "lpac.sim.batch": "fly_batch",
     "lpac.sim.cores": "in_this_process over_cores",

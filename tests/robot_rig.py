@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from edge.core.world import format_world, random_features
 from edge.messages.codes import Refusal, RefusalCode
 from edge.messages.mission import FlightState, OrderKind, Origin, RobotStatus
 from edge.robot.config import RobotConfig, load_config
+from lpac.analysis.worlds import format_world, random_features
 from lpac.fleet.writer import write_fleet
 from lpac.ground.station.client import GroundError
 from lpac.ground.station.client import command as ground_command

@@ -9,7 +9,7 @@ No repeated message can arm a vehicle.
 
 import hashlib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
@@ -54,7 +54,6 @@ Heading = Annotated[float, Meta(ge=0.0, lt=360.0)]
 SlotNumber = Annotated[int, Meta(ge=0, le=1000)]
 # A mission starts within this distance of the robot's own height.
 AT_SLOT_M = 1.0
-_OVER_LANDING_POINT_M = 1.5
 
 FailedChecks = Annotated[tuple[FailedCheck, ...], Meta(max_length=MOST_TEXTS)]
 _Point = Annotated[tuple[Metres, ...], Meta(min_length=2, max_length=2, description="[x, y]")]
@@ -361,36 +360,6 @@ _NEVER_NONE = (
 @cache
 def _numbers_of_status() -> tuple[str, ...]:
     return tuple(name for name, meta in bounds_of(RobotStatus).items() if meta.ge is not None)
-
-
-def is_over_landing_point(status: RobotStatus) -> bool:
-    """Whether the robot reports a position over its landing point."""
-    if status.position_m is None:
-        return False
-    return math.dist(status.position_m[:2], status.landing_point_m) < _OVER_LANDING_POINT_M
-
-
-def is_too_low(status: RobotStatus) -> bool:
-    """Whether the robot is too far below its own height to start a mission."""
-    if status.position_m is None:
-        return False
-    return status.slot_height_m - status.position_m[2] > AT_SLOT_M
-
-
-def waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int]) -> set[int]:
-    """Ids of robots in `arrived`, over their landing points, that must not land yet.
-
-    They would descend through the heights of lower robots that still fly home.
-    """
-    lowest_m = min(
-        (s.slot_height_m for r, s in statuses.items() if s.state in STEERED and r not in arrived),
-        default=math.inf,
-    )
-    return {
-        robot
-        for robot, status in statuses.items()
-        if robot in arrived and status.state in STEERED and status.slot_height_m > lowest_m
-    }
 
 
 def world_id(text: str) -> str:

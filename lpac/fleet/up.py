@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from edge.core.wire import PayloadType
 from edge.drivers.registry import load_policy
-from edge.flight.energy import trials
+from edge.flight.energy import EnergyParameters, home_s
 from edge.identity.group import frames
 from edge.policy.bundle import load_bundle
 from edge.robot.pac import message_bytes
@@ -244,6 +244,43 @@ def batteries_of(
             )
         found.append(BatteryReport(robot.name, share, endurance_s, count))
     return found
+
+
+def trials(
+    parameters: EnergyParameters,
+    *,
+    share: float,
+    min_battery: float,
+    battery_low: float,
+    battery_critical: float,
+    endurance_s: float,
+    trial_s: float,
+    away_m: float,
+    slot: int,
+    slot_height_m: float,
+    max_speed_m_s: float,
+    max_climb_m_s: float,
+) -> int:
+    """Number of trials that a pack allows, without any in which the robot would return early.
+
+    Each trial is a climb to the slot, a wait for the others, `trial_s` of mission, and the way home
+    from `away_m` with queue and landing. The next takeoff needs at least `min_battery`.
+    """
+    down_s = home_s(
+        parameters,
+        away_m=away_m,
+        height_m=slot_height_m,
+        slot=slot,
+        slot_height_m=slot_height_m,
+        max_speed_m_s=max_speed_m_s,
+        max_climb_m_s=max_climb_m_s,
+    )
+    returns_at = max(battery_low, battery_critical + down_s / endurance_s)
+    mission_s = 2.0 * slot_height_m / max_climb_m_s + trial_s
+    # Share that may be used before the last trial begins.
+    until = max(min_battery, returns_at + mission_s / endurance_s)
+    each_s = mission_s + down_s - parameters.reserve_s
+    return max(math.floor((share - until) * endurance_s / each_s) + 1, 0)
 
 
 def decide(diagnosis: Diagnosis) -> GoDecision:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from edge.core.world import format_world
 from lpac.analysis.figures import overview, snapshots_and_costs
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.style import save
+from lpac.analysis.worlds import format_world
 from lpac.sim.flight_summary import summary
 from lpac.sim.scenario import Scenario
 

@@ -10,9 +10,10 @@ from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import AtLeastOne, Bounded, Finite, NonNegative, Positive, Share
 from edge.core.wire import MAX_ROBOT_ID, PayloadType
-from edge.core.world import Feature, random_features
+from edge.core.world import Feature
 from edge.flight.margins import ErrorBudget
 from edge.policy.bundle import Bundle, BundleError
+from lpac.analysis.worlds import random_features
 from lpac.radio.airtime import LinkQuality, Transport
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName

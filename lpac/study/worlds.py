@@ -16,7 +16,8 @@ import numpy as np
 from msgspec import Meta
 
 from edge.core.schema import Bounded, Positive
-from edge.core.world import MOST_FEATURES, GaussianFeature, random_features
+from edge.core.world import MOST_FEATURES, GaussianFeature
+from lpac.analysis.worlds import random_features
 from lpac.sim.scenario import MAX_ROBOTS, Scenario
 
 WorldSet = Literal["training", "validation", "test"]

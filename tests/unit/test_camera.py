@@ -12,8 +12,9 @@ from lpac_camera.sensor import CameraOptions, camera
 from edge.core import F64
 from edge.core.perception import PerceptionParameters
 from edge.core.ports import Camera, Look, SensorSetting
-from edge.core.world import format_world, random_features, rasterize
+from edge.core.world import rasterize
 from edge.drivers.world_sensor import WorldSensor
+from lpac.analysis.worlds import format_world, random_features
 
 CELLS_PER_M = 16.0
 PERCEPTION = PerceptionParameters(512, 256, 64, 128.0)

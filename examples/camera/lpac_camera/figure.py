@@ -11,8 +11,9 @@ import numpy as np
 
 from edge.core.perception import PerceptionParameters, window_corner
 from edge.core.ports import SensorSetting
-from edge.core.world import format_world, random_features, rasterize
+from edge.core.world import rasterize
 from edge.drivers.world_sensor import WorldSensor
+from lpac.analysis.worlds import format_world, random_features
 from lpac_camera.sensor import CameraOptions, RenderedCamera, camera
 
 # As in the field: 16 cells a metre, the policy sees 4 m x 4 m.

@@ -17,7 +17,8 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from edge.core import F32, F64
-from edge.core.world import random_features, rasterize
+from edge.core.world import rasterize
+from lpac.analysis.worlds import random_features
 from lpac_camera.detector import GRAPH, MARGIN
 from lpac_camera.ground import COVER_AT_ONE, Ground
 from lpac_camera.pinhole import Pinhole

@@ -9,14 +9,7 @@ from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from typing import Any
 
 from edge.messages.codes import FENCE_NOT_TAKEN, ReasonCode, Refusal, RefusalCode, texts
-from edge.messages.mission import (
-    FlightState,
-    OrderKind,
-    RobotStatus,
-    is_over_landing_point,
-    is_too_low,
-    world_id,
-)
+from edge.messages.mission import AT_SLOT_M, FlightState, OrderKind, RobotStatus, world_id
 from lpac.analysis.snapshot import COMMANDER_SILENT_S
 from lpac.ground.rendering import NOT_HEARD, missing_checks, state_and_reason
 from lpac.ground.station.protocol import (
@@ -42,6 +35,7 @@ from lpac.ground.station.protocol import (
     command_name,
     in_words,
 )
+from lpac.ground.station.return_queue import is_over_landing_point
 from lpac.ground.station.states import next_trial
 from lpac.ground.station.station import Station, is_down
 from lpac.ground.station.statuses import TWO_PROGRAMS
@@ -836,6 +830,13 @@ def _came_down(
         away_m = math.dist(status.position_m[:2], status.landing_point_m)
         where = f"{away_m:.0f} m from its landing point"
     return f"landed {where}; last seen in flight in {state_and_reason(flown)}", _C.LANDED_ELSEWHERE
+
+
+def is_too_low(status: RobotStatus) -> bool:
+    """Whether the robot is too far below its own height to start a mission."""
+    if status.position_m is None:
+        return False
+    return status.slot_height_m - status.position_m[2] > AT_SLOT_M
 
 
 def _is_home(flown: RobotStatus, status: RobotStatus) -> bool:

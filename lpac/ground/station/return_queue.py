@@ -1,18 +1,15 @@
 """Order of landing in a return: from the lowest robot to the highest."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple
 
-from edge.messages.mission import (
-    GroundState,
-    SafetyAction,
-    is_over_landing_point,
-    waiting_to_land,
-)
+from edge.messages.mission import STEERED, GroundState, RobotStatus, SafetyAction
 from lpac.ground.station.statuses import RobotStatuses
 
 # A station that has just started knows all robots after this time.
 _GATHER_S = 3.0
+_OVER_LANDING_POINT_M = 1.5
 
 
 class QueuedReturn(NamedTuple):
@@ -44,7 +41,7 @@ class ReturnQueue:
             return None
         statuses = {r: s for r, s in self._robots.statuses().items() if r in returning}
         self._arrived |= {r for r, status in statuses.items() if is_over_landing_point(status)}
-        waiting = waiting_to_land(statuses, self._arrived)
+        waiting = _waiting_to_land(statuses, self._arrived)
         # A silent robot stays waiting; so do all while robots below may not be known yet.
         gathers = self._robots.age_s < _GATHER_S
         waiting |= {r for r in state.waiting if gathers or r not in statuses}
@@ -57,3 +54,26 @@ class ReturnQueue:
             elif state.safety_action != "return":
                 actions[str(robot)] = "return"
         return QueuedReturn(actions, tuple(sorted(waiting)))
+
+
+def is_over_landing_point(status: RobotStatus) -> bool:
+    """Whether the robot reports a position over its landing point."""
+    if status.position_m is None:
+        return False
+    return math.dist(status.position_m[:2], status.landing_point_m) < _OVER_LANDING_POINT_M
+
+
+def _waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int]) -> set[int]:
+    """Ids of robots in `arrived`, over their landing points, that must not land yet.
+
+    They would descend through the heights of lower robots that still fly home.
+    """
+    lowest_m = min(
+        (s.slot_height_m for r, s in statuses.items() if s.state in STEERED and r not in arrived),
+        default=math.inf,
+    )
+    return {
+        robot
+        for robot, status in statuses.items()
+        if robot in arrived and status.state in STEERED and status.slot_height_m > lowest_m
+    }

@@ -9,11 +9,11 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.frames import LocalTransform
-from edge.core.world import format_world
 from edge.flight.margins import places_apart
 from edge.messages.mission import Origin
 from edge.policy.bundle import load_bundle, make_bundle, write_bundle
 from lpac.analysis.truth import TrueTrack
+from lpac.analysis.worlds import format_world
 from lpac.fleet.settings import RobotPaths
 from lpac.fleet.writer import assign, write_fleet, write_robot
 from lpac.sim.description import FIELD_SCALE, fence_around, robot_table

@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from edge.core.world import format_world, random_features
+from lpac.analysis.worlds import format_world, random_features
 from lpac.fleet.writer import write_fleet
 from lpac.sim.description import FIELD_SCALE, fence_around, robot_table
 from lpac.sim.hosts.base import base_tree, require_tools

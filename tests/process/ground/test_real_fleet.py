@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from edge.core.world import format_world
 from edge.flight.margins import ErrorBudget
 from edge.messages.codes import ReasonCode, RefusalCode
 from edge.messages.mission import ON_GROUND, FlightState, RobotStatus, world_id
 from lpac.analysis.snapshot import FleetSnapshot
+from lpac.analysis.worlds import format_world
 from lpac.ground.station.client import GroundError, command, subscribe
 from lpac.ground.station.protocol import (
     CommandReport,

@@ -19,7 +19,6 @@ import onnx
 import pytest
 
 from edge.core.fence import Fence
-from edge.core.world import format_world, random_features
 from edge.drivers.log_reader import read as read_log
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.failsafe import PARAMETERS
@@ -35,6 +34,7 @@ from edge.messages.mission import (
 )
 from edge.messages.topics import EXPLORED
 from edge.policy.bundle import Bundle, make_bundle, write_bundle
+from lpac.analysis.worlds import format_world, random_features
 from lpac.ground.station.protocol import (
     NextTrial,
     Resume,

@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 from edge.core.vehicle import PILOTED
 from edge.messages.codes import ReasonCode, texts
-from edge.messages.mission import ON_GROUND, FlightState, RobotStatus, is_too_low
+from edge.messages.mission import ON_GROUND, FlightState, RobotStatus
+from lpac.ground.station.commands import is_too_low
 from lpac.ground.station.protocol import (
     CommandReport,
     Enable,

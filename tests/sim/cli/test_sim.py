@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.core.world import GaussianFeature, format_world, parse_world
+from edge.core.world import GaussianFeature, parse_world
 from edge.policy.bundle import load_bundle, make_bundle, write_bundle
+from lpac.analysis.worlds import format_world
 from tests.command import called, error_line
 from tests.conftest import SHIPPED
 

@@ -28,7 +28,7 @@ from edge.core.vehicle import (
     Velocity,
 )
 from edge.core.wire import FLOAT_PAYLOADS
-from edge.core.world import random_features, rasterize
+from edge.core.world import rasterize
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
 from edge.flight.state import FlightInputs
@@ -56,6 +56,7 @@ from edge.robot.navigation import Navigation
 from edge.robot.neighbours import NeighbourTable
 from edge.robot.pac import Pac
 from edge.robot.readiness import Checks
+from lpac.analysis.worlds import random_features
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import MavResult, Px4Mode
 from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle

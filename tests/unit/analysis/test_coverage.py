@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F64
-from edge.core.world import format_world, parse_world, random_features, rasterize
+from edge.core.world import parse_world, rasterize
 from edge.messages.mission import FlightState, RobotStatus
 from lpac.analysis.coverage import Coverage, LastPositions
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from lpac.analysis.voronoi import coverage_cost, voronoi_cells
+from lpac.analysis.worlds import format_world, random_features
 from tests.said import reason
 
 SIZE, SCALE = 128, 4.0

@@ -18,7 +18,7 @@ import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
-from edge.core.world import format_world, parse_world, random_features, rasterize
+from edge.core.world import parse_world, rasterize
 from edge.drivers.flight_log import FlightLog, FlightMetadata
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, LoopStatus, Order, OrderResult, RobotStatus
@@ -33,6 +33,7 @@ from lpac.analysis.missions import find_missions, whole_record
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.style import CURVES, SWARM, save
 from lpac.analysis.voronoi import coverage_cost
+from lpac.analysis.worlds import format_world, random_features
 from lpac.analysis.write_report import write
 from lpac.cli.main import app
 from lpac.ground.record import TOPICS, GroundMetadata

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from edge.core import F32, F64
-from edge.core.world import Feature, GaussianFeature, PolygonFeature, random_features
+from edge.core.world import Feature, GaussianFeature, PolygonFeature
 from lpac.analysis.voronoi import coverage_cost, cvt_velocity, local_centroid, voronoi_cells
+from lpac.analysis.worlds import random_features
 from tests.unit.core.reference import (
     coverage_control_core,
     point_vector,

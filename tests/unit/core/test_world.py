@@ -10,15 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F32
-from edge.core.world import (
-    Feature,
-    GaussianFeature,
-    PolygonFeature,
-    format_world,
-    parse_world,
-    random_features,
-    rasterize,
-)
+from edge.core.world import Feature, GaussianFeature, PolygonFeature, parse_world, rasterize
+from lpac.analysis.worlds import format_world, random_features
 from tests.unit.core.reference import (
     coverage_control_core,
     point_vector,

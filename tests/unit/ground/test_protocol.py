@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.memory import EXPLORED_CELLS
-from edge.core.world import MOST_FEATURES, format_world, random_features
+from edge.core.world import MOST_FEATURES
 from edge.messages.codec import MessageError
 from edge.messages.codes import RefusalCode
 from edge.messages.mission import (
@@ -26,6 +26,7 @@ from lpac.analysis.snapshot import (
     GroundEvent,
     RobotSnapshot,
 )
+from lpac.analysis.worlds import format_world, random_features
 from lpac.ground.station.protocol import (
     CommandProgress,
     CommandReport,

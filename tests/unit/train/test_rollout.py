@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core import F32, F64
-from edge.core.world import random_features, rasterize
+from edge.core.world import rasterize
 from edge.policy.bundle import Bundle
 from lpac.analysis.voronoi import coverage_cost, voronoi_cells
+from lpac.analysis.worlds import random_features
 from lpac.sim.batch import BatchedFlights, fly_batch
 from lpac.sim.description import FIELD_SCALE
 from lpac.study.worlds import FIELD, draw_world
