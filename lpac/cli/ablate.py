@@ -45,11 +45,11 @@ def ablate(
     read = read_ablation(ablation)
     cores = pool(ray)
     folder = out or _OUT / ablation.stem
-    with folder_lock("the ablation", folder), _progress() as tell:
-        results = AblationRun(read, folder, tell).run(cores)
-        told = write_report(read, results, folder)
+    with folder_lock("the ablation", folder), _progress() as on_progress:
+        results = AblationRun(read, folder, on_progress).run(cores)
+        document = write_report(read, results, folder)
     if as_json:
-        typer.echo(json.dumps(told, indent=2))
+        typer.echo(json.dumps(document, indent=2))
     else:
         _show(read, results, folder)
 
@@ -58,13 +58,13 @@ def ablate(
 def _progress() -> "Iterator[Callable[[AblationProgress], None]]":
     with progress_of_run() as show:
 
-        def tell(now: "AblationProgress") -> None:
+        def on_progress(now: "AblationProgress") -> None:
             training = now.training
             stage = f"{now.doing}: {training.stage}" if training else now.doing
             numbers = numbers_of_training(training) if training else []
             show(now.done, stage, [*numbers, *time_left(now.left_s)])
 
-        yield tell
+        yield on_progress
 
 
 def _show(read: "Ablation", results: "list[VariantResult]", folder: Path) -> None:
@@ -86,7 +86,7 @@ def _show(read: "Ablation", results: "list[VariantResult]", folder: Path) -> Non
         typer.echo(f"\n{claim}")
     if config.world_set == "test":
         typer.echo(
-            f"\nthe test set was opened, {config.worlds} worlds of it: whoever chooses by this "
-            "has none any more"
+            f"\n{config.worlds} worlds of the test set were used: if you select by these results, "
+            "it is no longer a test set"
         )
     typer.echo(f"\nsee {folder}: README.md, ablation.json, differences.png, and each training")

@@ -27,7 +27,7 @@ app = new_app(
 )
 
 _OUT = Path("out/bench/network")
-# Robots, repetitions, s: the paper's; for the curves, as many repetitions as they need.
+# Robots, repetitions, and seconds: the paper's for restarts, our own for the curves.
 _RESTARTS = (3, 10, 60.0)
 _ROBOTS = (10, 3, 10.0)
 
@@ -62,12 +62,12 @@ class NetworkOptions:
         int | None,
         typer.Option(
             "--robots", "-n",
-            help="How many robots restart (3 if not given), and up to how many the curves go (10).",
+            help="Number of robots that restart (3 if not given), and maximum for the curves (10).",
         ),
     ] = None  # fmt: skip
     repetitions: Annotated[
         Annotated[int, Meta(ge=1)] | None,
-        "If not given, 10 of restarts, 3 of each point of a curve.",
+        "If not given, 10 with restarts, 3 per point of a curve.",
     ] = None
     seconds: Annotated[
         Annotated[float, Meta(ge=1.0)] | None,
@@ -101,8 +101,8 @@ def network(of: NetworkOptions) -> None:
         for run in measured:
             runs.append(run)
             # An interrupted measurement keeps its results.
-            told = json.dumps(to_json(where, runs), indent=2)
-            write_atomically(of.out / "network.json", f"{told}\n".encode())
+            text = json.dumps(to_json(where, runs), indent=2)
+            write_atomically(of.out / "network.json", f"{text}\n".encode())
     _draw(runs, of.out)
     if of.as_json:
         typer.echo(json.dumps(to_json(where, runs), indent=2))
@@ -142,8 +142,8 @@ def _checked(given: Sequence[str] | None) -> tuple[str, ...]:
 def _plan(experiment: "Experiment", middlewares: tuple[str, ...], of: NetworkOptions) -> "Plan":
     from lpac.middleware.measure import Plan
 
-    its_robots, its_repetitions, its_seconds = _RESTARTS if experiment == "restarts" else _ROBOTS
-    fleet = its_robots if of.robots is None else of.robots
+    robots, repetitions, seconds = _RESTARTS if experiment == "restarts" else _ROBOTS
+    fleet = robots if of.robots is None else of.robots
     least = 2 if experiment == "restarts" else 1
     if fleet < least:
         raise ValueError(f"--robots {fleet}: {experiment} needs at least {least}")
@@ -151,8 +151,8 @@ def _plan(experiment: "Experiment", middlewares: tuple[str, ...], of: NetworkOpt
         experiment=experiment,
         middlewares=middlewares,
         robots=(fleet,) if experiment == "restarts" else tuple(range(1, fleet + 1)),
-        repetitions=of.repetitions or its_repetitions,
-        seconds=of.seconds or its_seconds,
+        repetitions=of.repetitions or repetitions,
+        seconds=of.seconds or seconds,
     )
 
 
@@ -210,12 +210,12 @@ def _measure(
     with progress_of("runs") as progress:
         task = progress.add_task("", total=sum(1 for plan in plans for _ in plan.runs()))
 
-        def tell(repetition: int, robots: int, middleware: str) -> None:
+        def on_progress(repetition: int, robots: int, middleware: str) -> None:
             doing = f"robots: {robots}, {title_of(middleware)}, repetition {repetition}"
             progress.update(task, description=doing)
 
         for plan in plans:
-            with closing(measure(plan, places, tell)) as runs:
+            with closing(measure(plan, places, on_progress)) as runs:
                 for run in runs:
                     progress.update(task, advance=1)
                     yield run
@@ -226,9 +226,9 @@ def _draw(runs: Sequence["Run"], out: Path) -> None:
     from lpac.middleware.figures import of_restarts, over_robots
 
     for experiment, drawn in (("restarts", of_restarts), ("robots", over_robots)):
-        its = [run for run in runs if run.experiment == experiment]
-        if its:
-            style.save(drawn(its), out / experiment)
+        own = [run for run in runs if run.experiment == experiment]
+        if own:
+            style.save(drawn(own), out / experiment)
 
 
 def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
@@ -237,23 +237,23 @@ def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
     of_each = summaries(runs)
     restarts = [summary for summary in of_each if summary.experiment == "restarts"]
     if restarts:
-        its = [run for run in runs if run.experiment == "restarts"]
+        seconds = next(run.seconds for run in runs if run.experiment == "restarts")
         typer.echo(
             f"throughput between two of {restarts[0].robots} robots whose programs all restart, "
-            f"{its[0].seconds:.0f} s; mean and standard deviation\n"
+            f"{seconds:.0f} s; mean and standard deviation\n"
         )
         _print_summaries(_RESTART_COLUMNS, restarts)
     curves = [summary for summary in of_each if summary.experiment == "robots"]
     if curves:
         typer.echo(
-            f"{chr(10) if restarts else ''}throughput between two places while so many robots' "
-            "programs run, and how old their messages are when they arrive\n"
+            f"{chr(10) if restarts else ''}throughput between two places while the robots' "
+            "programs run, and the age of their messages on arrival\n"
         )
         _print_summaries(_CURVE_COLUMNS, curves)
     if where["where"] == "loopback":
         typer.echo(
-            "\nmeasured on this machine's loopback, which has no radio: the stream is as fast as "
-            "the processors are, and takes them from the robots; see --namespaces"
+            "\nmeasured on this machine's loopback, which has no radio: the processors limit the "
+            "stream, which takes them from the robots; see --namespaces"
         )
     if left := left_out(runs):
         typer.echo(f"\n{left}")
@@ -263,9 +263,9 @@ def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
 
 
 _LEGEND = (
-    "\ndelivered: of the robots' messages, those of the 10 s after a restart if there are some; "
-    "heard after: how long after a restart robots first heard each other, half of all pairs and "
-    "the last; never: pairs that did not until the next; busy: this machine's processors"
+    "\ndelivered: share of the robots' messages, with restarts in the 10 s after each; heard "
+    "after: time from a restart until half of all pairs, and the last, hear each other again; "
+    "never: pairs that did not before the next restart; busy: this machine's processors"
 )
 _DELIVERED = ("delivered, %", lambda of: _number(of.measures.get("delivered"), 100.0))
 _THROUGHPUT = ("Mbit/s", lambda of: _number(of.measures["throughput_mbit_s"]))

@@ -27,7 +27,7 @@ from lpac.cli.options import (
     require_here,
 )
 from lpac.cli.printing import print_table
-from lpac.cli.study import show_report, telling
+from lpac.cli.study import progress_counter, show_report
 
 if TYPE_CHECKING:
     from lpac.study.drill_report import Outcomes
@@ -125,17 +125,17 @@ def fly_faults(
         # Beside its logs, since a campaign's report must not be overwritten.
         folder = logs_of(flights[0], folder)
     else:
-        with folder_lock("the drill", folder), telling("flights") as tell:
-            outcomes = fly_drill(flights, folder, cores, tell)
-    _tell(outcomes, folder, as_json=as_json)
+        with folder_lock("the drill", folder), progress_counter("flights") as on_progress:
+            outcomes = fly_drill(flights, folder, cores, on_progress)
+    _report(outcomes, folder, as_json=as_json)
     if again or in_real_time:
-        said = "logs and figures are there, too; `lpac report FOLDER` has more of a mission"
-        typer.echo(said, err=True)
+        note = "logs and figures are there, too; `lpac report FOLDER` shows more of a mission"
+        typer.echo(note, err=True)
     if not all(outcome.held for outcome in outcomes.values()):
         raise typer.Exit(1)
 
 
-def _tell(outcomes: "Outcomes", folder: Path, *, as_json: bool) -> None:
+def _report(outcomes: "Outcomes", folder: Path, *, as_json: bool) -> None:
     """Write the report and JUnit's XML, and print the report."""
     from lpac.study.drill_report import as_junit, report_of
     from lpac.study.provenance import made_by

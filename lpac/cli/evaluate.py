@@ -92,7 +92,7 @@ class ConditionOptions:
         list[Transport] | None,
         typer.Option(
             "--transport",
-            help="Also with such a team's radio, by a model of one Wi-Fi channel.",
+            help="Also with a team's radio, by a model of one Wi-Fi channel.",
         ),
     ] = None
     wifi: WifiFile = None
@@ -119,8 +119,8 @@ class ConditionOptions:
         list[str] | None,
         typer.Option(
             "--payload", metavar="TYPE",
-            help="Also with messages in float32 or int8 instead of float16, and each --loss and "
-            "--transport with these.",
+            help="Also with messages in float32 or int8 instead of float16, alone and with each "
+            "--loss and --transport.",
         ),
     ] = None  # fmt: skip
     vehicle: Annotated[
@@ -177,7 +177,7 @@ def _check(options: EvaluateOptions, hard: ConditionOptions, given: Sequence[str
     if options.compare and len(given) != 2:
         raise ValueError(f"--compare needs two methods; {len(given)} given")
     if hard.losses and hard.transports:
-        raise ValueError("--loss and --transport: the model itself says what is lost")
+        raise ValueError("--loss and --transport: the model of --transport decides what is lost")
     if options.transfer and hard.vehicle is not VehicleKind.POINT:
         raise ValueError("--transfer has teams that do not fly whole: choose others with --set-up")
     if options.transfer and options.set_ups:
@@ -232,7 +232,7 @@ def _changes(hard: ConditionOptions, calibrated: "Calibration") -> list[dict[str
 
 
 def _names(given: Sequence[str]) -> list[str]:
-    """Short names: the fewest last parts of each path that tell it from the others."""
+    """Short names: the fewest last parts of each path that make it unique."""
     parts = [[Path(path).resolve().parts for path in text.split(",")] for text in given]
     for depth in range(1, max(len(part) for text in parts for part in text) + 1):
         names = [",".join("/".join(part[-depth:]) for part in text) for text in parts]

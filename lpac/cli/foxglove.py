@@ -1,4 +1,4 @@
-"""`lpac foxglove`: the fleet, and its logs, in Foxglove."""
+"""`lpac foxglove`: show the fleet and its logs in Foxglove."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,9 +18,9 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.")]
 @app.command()
 def live(
     fleet: Fleet = DEFAULT_FLEET,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 8765,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free port.")] = 8765,
     host: Annotated[
-        str, typer.Option(help="Where to serve; beyond this machine anybody there can look.")
+        str, typer.Option(help="Address to serve; on a network, everybody there can look.")
     ] = "127.0.0.1",
 ) -> None:
     """Serve the fleet to Foxglove, until Ctrl-C; needs `lpac ground`. It only observes."""
@@ -34,8 +34,8 @@ def live(
     require_host("--host", host)
     name = load_fleet(fleet).fleet
 
-    def ready(its_port: int) -> None:
-        typer.echo(f"fleet {name} for Foxglove: open a connection to ws://{host}:{its_port}")
+    def ready(bound_port: int) -> None:
+        typer.echo(f"fleet {name} for Foxglove: open a connection to ws://{host}:{bound_port}")
         typer.echo("it only observes; `lpac foxglove layout` writes the panels to import")
         typer.echo("Ctrl-C ends it, and nothing else")
 
@@ -47,7 +47,7 @@ def log(
     folder: Annotated[Path, typer.Argument(help="Folder with what `lpac record` wrote.")],
     out: Out = Path("foxglove.mcap"),
 ) -> None:
-    """Turn the ground's logs into one file that Foxglove shows as it shows a fleet live."""
+    """Convert the ground's logs to one file that Foxglove shows like a live fleet."""
     from lpac.ground.foxglove.logs import convert, ground_logs
 
     paths = ground_logs(folder)
@@ -59,6 +59,6 @@ def log(
 
 @app.command()
 def layout(out: Out = Path("lpac.layout.json")) -> None:
-    """Write the layout: import it in Foxglove, for a fleet live, and for logs."""
+    """Write the layout to import in Foxglove, for a live fleet and for logs."""
     out.write_text(_LAYOUT.read_text())
     typer.echo(f"{out}: in Foxglove, Layouts, Import from file")

@@ -56,12 +56,8 @@ def ask(
     from lpac.ground.station.client import command
     from lpac.ground.station.protocol import SafetyCommand
 
-    told = (
-        f"robots that were told to {name} go on with it"
-        if isinstance(request, SafetyCommand)
-        else ""
-    )
-    with interruptible(name, told), _progress() as on_progress:
+    left = f"robots that were ordered to {name} do so" if isinstance(request, SafetyCommand) else ""
+    with interruptible(name, left), _progress() as on_progress:
         report = command(to.fleet, request, on_progress)
     show(to, report, name, as_json=as_json, details=details or {})
 
@@ -80,7 +76,7 @@ def show(
         problem = report.problem and dataclasses.asdict(report.problem)
         print_json({"fleet": to.fleet, "problem": problem, "robots": robots})
     elif report.results:
-        headings = list(dict.fromkeys(key for its in details.values() for key in its))
+        headings = list(dict.fromkeys(key for detail in details.values() for key in detail))
         rows: list[list[str | Text]] = [
             [
                 r.robot,
@@ -153,25 +149,25 @@ def print_json(mapping: dict[str, object]) -> None:
 @contextmanager
 def _progress() -> Iterator[Callable[["CommandProgress"], None]]:
     """Progress on stderr: a live table, or a line per step without a terminal."""
-    told: dict[str, str] = {}
+    newest: dict[str, str] = {}
 
     def table() -> "Table":
         from rich.table import Table
 
         rows = Table.grid(padding=(0, 2, 0, 0))
-        for robot, text in told.items():
+        for robot, text in newest.items():
             rows.add_row(styled(robot, ""), styled(text, FAINT))
         return rows
 
-    def how_far() -> str:
-        last = [f"{robot}  {text}".strip() for robot, text in list(told.items())]
-        return "; ".join(last) or "nothing yet"
+    def status_line() -> str:
+        lines = [f"{robot}  {text}".strip() for robot, text in list(newest.items())]
+        return "; ".join(lines) or "nothing yet"
 
     def on_progress(progress: "CommandProgress") -> None:
-        told[progress.robot] = progress.text
+        newest[progress.robot] = progress.text
         if not view.is_live:
             view.line(f"{progress.robot}  {progress.text}".strip())
 
-    view = LiveView(table, how_far)
+    view = LiveView(table, status_line)
     with view.shown():
         yield on_progress

@@ -55,7 +55,7 @@ _EXTRAS = {
 }
 _INTERRUPTED = 130
 # These store finished work, and continue when repeated.
-_GO_ON = ("train", "ablate", "evaluate", "study", "drill")
+_CONTINUE = ("train", "ablate", "evaluate", "study", "drill")
 
 
 class _Lpac(CommandList):
@@ -86,19 +86,19 @@ class _Lpac(CommandList):
             # Python remembers an interrupt inside exec(), which namedtuple calls on import, and
             # `python -m` then dies of the signal even if it is caught. The next exec() resets it.
             exec("")
-            then = ": the same command goes on" if ctx.invoked_subcommand in _GO_ON else ""
+            then = ": the same command continues" if ctx.invoked_subcommand in _CONTINUE else ""
             typer.echo(f"lpac: interrupted{then}", err=True)
             raise typer.Exit(_INTERRUPTED) from None
         except ModuleNotFoundError as error:
-            sys.exit(_what_is_missing(error, ctx.invoked_subcommand))
+            sys.exit(_missing_package(error, ctx.invoked_subcommand))
 
 
-def _what_is_missing(error: ModuleNotFoundError, command: str | None) -> str:
-    """One line with the remedy. Raises the error if none of our extras would help."""
+def _missing_package(error: ModuleNotFoundError, command: str | None) -> str:
+    """One line with the remedy. Raises the error if no extra would help."""
     package = (error.name or "").split(".")[0]
     if package in ("lpac", "export"):
-        return f"lpac: {error.name} is not installed here: this command is the workstation's"
-    extra = next((extra for extra, its in _EXTRAS.items() if command in its), None)
+        return f"lpac: {error.name} is not installed here: this command is for a workstation"
+    extra = next((extra for extra, commands in _EXTRAS.items() if command in commands), None)
     if package == "edge" or extra is None:
         raise error
     from lpac.extras import install_command
@@ -142,13 +142,13 @@ def main() -> None:
     try:
         app()
     except OSError as error:
-        sys.exit(f"lpac: {_in_words(error)}")
+        sys.exit(f"lpac: {_text(error)}")
     except ValueError as error:
         sys.exit(f"lpac: {error}")
 
 
-def _in_words(error: OSError) -> str:
-    """The file and its fault; errors without a file, or with our own text, are unchanged."""
+def _text(error: OSError) -> str:
+    """Text with the file and its fault, or the error's own if it has no file."""
     from edge.core.file_errors import in_words, is_known
 
     if error.filename is None or not is_known(error):

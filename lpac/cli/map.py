@@ -23,12 +23,10 @@ class MapOptions:
     """Options of `lpac map`: address, and whether the page may command."""
 
     fleet: Fleet = DEFAULT_FLEET
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = (
-        8300
-    )
-    host: Annotated[str, "Where to serve; beyond this machine it asks for a token."] = "127.0.0.1"
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free port.")] = 8300
+    host: Annotated[str, "Address to serve; on a network the page needs a token."] = "127.0.0.1"
     operate: Annotated[bool, "Also command the fleet from the page."] = False
-    token: Annotated[str | None, "The token; if not given, one is made where needed."] = None
+    token: Annotated[str | None, "The token; by default one is made if needed."] = None
     over_tls: Annotated[
         bool, typer.Option("--tls", help="Serve over TLS, from the laptop with the authority.")
     ] = False
@@ -40,7 +38,7 @@ class MapOptions:
 def live_map(page: MapOptions) -> None:
     """Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.
 
-    It only observes, unless --operate is given; then it asks for a token, which is part of the
+    It only observes, unless --operate is given; it then needs a token, which is part of the
     address. Without --tls anybody who listens on the network can read the token; with it, each
     browser has to import the authority once.
     """

@@ -160,8 +160,10 @@ def _task(name: str, options: ExperimentOptions, changes: Changes) -> StudyTask:
     words += [] if vehicle is VehicleKind.POINT else ["--vehicle", vehicle.value]
     for key, number in given.items():
         words += [f"--{key.removeprefix('first_')}", str(number)]
-    words += [word for its in changes.set_ups or () for word in ("--set-up", its)]
-    words += [word for its in bundles if its != DEFAULT_BUNDLE for word in ("--bundle", str(its))]
+    words += [word for each in changes.set_ups or () for word in ("--set-up", each)]
+    words += [
+        word for path in bundles if path != DEFAULT_BUNDLE for word in ("--bundle", str(path))
+    ]
     words += ["--quick"] if changes.quick else []
     return StudyTask(
         name=name, study=replace(study, **given), folder=options.out or _OUT / name,
@@ -204,7 +206,7 @@ def _from_logs(name: str, logs: Path, options: ExperimentOptions) -> None:
     bundle = options.bundles[0] if options.bundles else None
     records = _missions(logs, options, bundle)
     words = ["paper", name, "--logs", str(logs)]
-    words += [word for its in options.trial or () for word in ("--trial", its)]
+    words += [word for trial in options.trial or () for word in ("--trial", trial)]
     words += ["--world-file", str(options.world_file)] if options.world_file is not None else []
     words += ["--bundle", str(bundle)] if bundle is not None else []
     report = REPORTS[name](
@@ -258,7 +260,7 @@ def network(
     folder = out or _OUT / "network"
     robots, repetitions, seconds = _QUICK_NETWORK if quick else (None, None, None)
     measure(
-        middlewares=[name for name, its in MIDDLEWARES.items() if its.version() is not None],
+        middlewares=[name for name, each in MIDDLEWARES.items() if each.version() is not None],
         robots=robots,
         repetitions=repetitions,
         seconds=seconds,
@@ -266,9 +268,9 @@ def network(
         as_json=as_json,
         out=folder,
     )
-    told = json.loads((folder / "network.json").read_text())
+    measured = json.loads((folder / "network.json").read_text())
     command = _network_command(namespaces, quick=quick)
-    network_report(told, made_by(command, [])).write(folder)
+    network_report(measured, made_by(command, [])).write(folder)
     (folder / _MADE_FOR_ALL).unlink(missing_ok=True)
 
 
@@ -300,21 +302,21 @@ def everything(
     # Fail before hours of flights.
     require_namespaces(namespaces, _QUICK_NETWORK[0] if quick else None)
     tasks = [_task_of_all(name, bundle, folder, quick=quick) for name in _IN_THE_AIR]
-    told = {task.name: made_by(task.command, [loaded.id]) for task in tasks}
-    told["network"] = made_by(_network_command(namespaces, quick=quick), [])
-    missing = [task for task in tasks if not _is_made(task.folder, told[task.name])]
+    provenance = {task.name: made_by(task.command, [loaded.id]) for task in tasks}
+    provenance["network"] = made_by(_network_command(namespaces, quick=quick), [])
+    missing = [task for task in tasks if not _is_made(task.folder, provenance[task.name])]
     reports = fly_together(missing, folder, ray) if missing else []
     for task, report in zip(missing, reports, strict=True):
         typer.echo(f"{task.name}\n")
         show_report(report, task.folder)
         typer.echo()
-        _note_made(task.folder, told[task.name])
-    if not _is_made(folder / "network", told["network"]):
+        _note_made(task.folder, provenance[task.name])
+    if not _is_made(folder / "network", provenance["network"]):
         typer.echo("network\n")
         network(quick=quick, namespaces=namespaces, out=folder / "network")
         typer.echo()
-        _note_made(folder / "network", told["network"])
-    typer.echo(f"see {write_page(folder, loaded, told)}")
+        _note_made(folder / "network", provenance["network"])
+    typer.echo(f"see {write_page(folder, loaded, provenance)}")
 
 
 def _task_of_all(name: str, bundle: Path, folder: Path, *, quick: bool) -> StudyTask:
@@ -328,7 +330,7 @@ def _task_of_all(name: str, bundle: Path, folder: Path, *, quick: bool) -> Study
 
 
 def _is_made(folder: Path, made_by: Mapping[str, str]) -> bool:
-    """Whether the folder has results that were made in this way."""
+    """Whether the folder has results of this provenance."""
     kept = folder / _MADE_FOR_ALL
     return kept.exists() and json.loads(kept.read_text()) == made_by
 

@@ -45,7 +45,7 @@ def print_table(
 
 
 def print_notes(notes: Sequence[tuple[str, "str | Text"]]) -> None:
-    """Print lines of a robot's name and a note, below a table."""
+    """Print a line per note, with its robot's name, below a table."""
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -81,43 +81,43 @@ def new_table(*, narrow: bool, heading: bool = True) -> "Table":
 
 
 @contextmanager
-def lines_of(how_far: Callable[[], str]) -> Iterator[None]:
-    """Within this context, print `how_far()` on stderr every `LINE_EVERY_S`, without a terminal.
+def periodic_lines(status_line: Callable[[], str]) -> Iterator[None]:
+    """Within this context, print `status_line()` on stderr every `LINE_EVERY_S`.
 
-    Once lines were printed, a changed last one is also printed at the end. `how_far` is called in
-    another thread.
+    If lines were printed and the last one has changed, it is also printed at the end. `status_line`
+    is called in another thread.
     """
     ended = threading.Event()
     last = ""
 
-    def tell() -> None:
+    def print_lines() -> None:
         nonlocal last
         # A closed pipe must not end the work.
         with suppress(OSError):
             while not ended.wait(LINE_EVERY_S):
-                last = how_far()
+                last = status_line()
                 typer.echo(last, err=True)
 
-    thread = threading.Thread(target=tell, daemon=True)
+    thread = threading.Thread(target=print_lines, daemon=True)
     thread.start()
     try:
         yield
     finally:
         ended.set()
         thread.join()
-    if last and how_far() != last:
+    if last and status_line() != last:
         with suppress(OSError):
-            typer.echo(how_far(), err=True)
+            typer.echo(status_line(), err=True)
 
 
 class LiveView:
-    """Progress on stderr: `render` live on a terminal, else lines of `how_far`.
+    """Progress on stderr: `render` live on a terminal, else lines of `status_line`.
 
     Without `live` a terminal gets lines too, for example with JSON on stdout.
     """
 
     def __init__(
-        self, render: Callable[[], "RenderableType"], how_far: Callable[[], str], *,
+        self, render: Callable[[], "RenderableType"], status_line: Callable[[], str], *,
         live: bool = True,
     ) -> None:  # fmt: skip
         from rich.console import Console
@@ -125,7 +125,7 @@ class LiveView:
 
         self._console = Console(stderr=True, highlight=False, markup=False)
         self._live = Live(get_renderable=render, console=self._console, transient=True)
-        self._how_far = how_far
+        self._status_line = status_line
         self.is_live = live and self._console.is_terminal
         self._began_s = time.monotonic()
 
@@ -136,7 +136,8 @@ class LiveView:
     @contextmanager
     def shown(self) -> Iterator[None]:
         """Show the view within this context."""
-        with self._live if self.is_live else lines_of(lambda: self._timed(self._how_far())):
+        lines = periodic_lines(lambda: self._timed(self._status_line()))
+        with self._live if self.is_live else lines:
             yield
 
     @contextmanager
@@ -168,17 +169,17 @@ def progress_of(what: str) -> Iterator["Progress"]:
         TextColumn("{task.description}"), console=Console(stderr=True), transient=True,
     )  # fmt: skip
 
-    def how_far() -> str:
+    def status_line() -> str:
         running = [task for task in progress.tasks if not task.finished] or progress.tasks[-1:]
-        words = []
+        texts = []
         for task in running:
             of = "" if task.total is None else f" of {task.total:g}"
             left = [] if task.finished else time_left(task.time_remaining)
-            said = [f"{what} {task.completed:g}{of}", *left]
-            words.append(", ".join([*said, *filter(None, [task.description])]))
-        return "; ".join(words) or what
+            parts = (f"{what} {task.completed:g}{of}", *left, task.description)
+            texts.append(", ".join(filter(None, parts)))
+        return "; ".join(texts) or what
 
-    with _shown(progress, how_far):
+    with _shown(progress, status_line):
         yield progress
 
 
@@ -197,12 +198,12 @@ def progress_of_run() -> Iterator[Callable[[float, str, Sequence[str]], None]]:
     def show(done: float, stage: str, numbers: Sequence[str]) -> None:
         progress.update(task, completed=done, stage=stage, numbers="  ".join(numbers))
 
-    def how_far() -> str:
+    def status_line() -> str:
         now = progress.tasks[0]
-        said = (now.fields["stage"], f"{now.percentage:.0f} %", now.fields["numbers"])
-        return "  ".join(filter(None, said))
+        parts = (now.fields["stage"], f"{now.percentage:.0f} %", now.fields["numbers"])
+        return "  ".join(filter(None, parts))
 
-    with _shown(progress, how_far):
+    with _shown(progress, status_line):
         yield show
 
 
@@ -212,12 +213,12 @@ def working(text: str) -> Iterator[None]:
     from rich.console import Console
 
     console = Console(stderr=True, highlight=False, markup=False)
-    with console.status(text) if console.is_terminal else lines_of(lambda: text):
+    with console.status(text) if console.is_terminal else periodic_lines(lambda: text):
         yield
 
 
-def _shown(progress: "Progress", how_far: Callable[[], str]) -> AbstractContextManager[object]:
-    return progress if progress.console.is_terminal else lines_of(how_far)
+def _shown(progress: "Progress", status_line: Callable[[], str]) -> AbstractContextManager[object]:
+    return progress if progress.console.is_terminal else periodic_lines(status_line)
 
 
 def time_left(left_s: float | None) -> list[str]:

@@ -23,11 +23,11 @@ app = new_app()
 
 # Per log; `--json` has all.
 _MOST_ROWS = 20
-_ROUNDS = "another kind of processor rounds otherwise in the last digits, the same one does not"
+_ROUNDS = "the last digits may differ on another kind of processor, but not on the same one"
 
 
-class _RunAgain(NamedTuple):
-    """Result: the policy, if it ran, and the flight decisions by segment of the logs."""
+class _Replay(NamedTuple):
+    """Results for the policy, if it ran, and for the flight decisions, by segment of the logs."""
 
     metadata: "Mapping[Path, FlightMetadata]"
     bundle: "Bundle | None"
@@ -51,8 +51,8 @@ def replay(
     as_json: AsJson = False,
 ) -> None:
     """Recompute policy and flight decisions from flight logs, and print differences."""
-    with working("running the logs again"):
-        of = _run_again(logs, bundle)
+    with working("replaying the logs"):
+        of = _replay(logs, bundle)
     for gap in of.missing:
         typer.echo(f"lpac: {gap}", err=True)
     if as_json:
@@ -68,15 +68,15 @@ def replay(
     if problems:
         raise ValueError("; ".join(problems))
     if not as_json:
-        _print_well(of)
+        _print_equal(of)
 
 
-def _run_again(logs: list[Path], bundle: Path | None) -> _RunAgain:
+def _replay(logs: list[Path], bundle: Path | None) -> _Replay:
     from edge.drivers.log_reader import LogGap
 
     metadata = _metadata(logs)
     missing = list[LogGap]()
-    of = _RunAgain(metadata, None, (), _flights(metadata, missing), missing)
+    of = _Replay(metadata, None, (), _flights(metadata, missing), missing)
     if _has_policy_ticks(metadata):
         policy_bundle, comparisons = _policy(metadata, bundle)
         return of._replace(bundle=policy_bundle, comparisons=comparisons)
@@ -85,20 +85,20 @@ def _run_again(logs: list[Path], bundle: Path | None) -> _RunAgain:
     return of
 
 
-def _print_well(of: _RunAgain) -> None:
-    """Print the result of a run without differences."""
+def _print_equal(of: _Replay) -> None:
+    """Print the result of a replay without differences."""
     if of.bundle is not None:
         found = "computes what it computed in flight"
         if not of.comparisons:
-            found = "is not run again: only policies of the family lpac are"
+            found = "was not replayed: only policies of the family lpac are"
         typer.echo(f"{of.bundle.manifest.name} {of.bundle.id[:12]}: {found}")
     if of.has_flight:
-        passed = sum(flight.passed_over for flight in of.flights.values())
-        but = f", but for {passed:,} ticks that were passed over" if passed else ""
+        skipped = sum(flight.passed_over for flight in of.flights.values())
+        but = f", except {skipped:,} ticks that were skipped" if skipped else ""
         typer.echo(f"flight: decides what it decided in flight{but}")
 
 
-def _problems(of: _RunAgain) -> list[str]:
+def _problems(of: _Replay) -> list[str]:
     """Differences from the flight, and damaged logs."""
     problems = []
     differing = [c for c in of.comparisons if c.differing]
@@ -113,7 +113,7 @@ def _problems(of: _RunAgain) -> list[str]:
         )
     damaged = sorted({gap.path.name for gap in of.missing if gap.damaged})
     if damaged:
-        problems.append(f"not all could be run again: {', '.join(damaged)}: damaged")
+        problems.append(f"not all could be replayed: {', '.join(damaged)}: damaged")
     return problems
 
 
@@ -161,7 +161,7 @@ def _policy(
         # The internal state of other families is not in the log.
         return bundle, ()
     messages = chain.from_iterable(
-        read(path, "perception", "policy", on_gap=_told_already) for path in metadata
+        read(path, "perception", "policy", on_gap=_reported_already) for path in metadata
     )
     return bundle, run_again(LpacPolicy(bundle), messages)
 
@@ -169,10 +169,10 @@ def _policy(
 def _has_policy_ticks(paths: Iterable[Path]) -> bool:
     from edge.drivers.log_reader import read
 
-    return any(True for path in paths for _ in read(path, "policy", on_gap=_told_already))
+    return any(True for path in paths for _ in read(path, "policy", on_gap=_reported_already))
 
 
-def _told_already(_: "LogGap") -> None:
+def _reported_already(_: "LogGap") -> None:
     """Ignore a gap: `_flights`, which reads all logs, reports it."""
 
 
@@ -210,12 +210,12 @@ def _print_flights(
         name, robot = f"{path.stem:{width}}", str(metadata[path].robot_id)
         if not flight.ticks:
             typer.echo(
-                f"{name} holds nothing that its flight was decided by "
+                f"{name} has no inputs of flight decisions "
                 f"(written by lpac-edge {metadata[path].version})"
             )
             continue
-        passed = f", {flight.passed_over:,} passed over" if flight.passed_over else ""
-        typer.echo(f"{name} {flight.ticks:7,} ticks, {flight.differing:,} differ{passed}")
+        skipped = f", {flight.passed_over:,} skipped" if flight.passed_over else ""
+        typer.echo(f"{name} {flight.ticks:7,} ticks, {flight.differing:,} differ{skipped}")
         for difference in flight.differences[:_MOST_ROWS]:
             what, then, now, _ = difference.differing
             at_s = difference.since_unix_s - flight.began_unix_s
@@ -233,7 +233,7 @@ def _print_flights(
         )
 
 
-def _described(of: _RunAgain) -> dict[str, Any]:
+def _described(of: _Replay) -> dict[str, Any]:
     return {
         "bundle": of.bundle and of.bundle.id,
         "robots": sorted({each.robot_id for each in of.metadata.values()}),
@@ -247,7 +247,9 @@ def _described(of: _RunAgain) -> dict[str, Any]:
             for c in of.comparisons
         },
         "missing": [{**gap._asdict(), "path": str(gap.path)} for gap in of.missing],
-        "flights": [_flight(path, of.metadata[path], its) for path, its in of.flights.items()],
+        "flights": [
+            _flight(path, of.metadata[path], flight) for path, flight in of.flights.items()
+        ],
     }
 
 

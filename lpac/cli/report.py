@@ -53,14 +53,14 @@ def report(of: ReportOptions) -> None:
     )
     with progress_of_run() as show:
 
-        def tell(what: str, share: float) -> None:
+        def on_progress(what: str, share: float) -> None:
             show(share, what, ())
 
-        examined = examine(of.folders, wanted, tell)
+        examined = examine(of.folders, wanted, on_progress)
         # Imported only when needed: matplotlib takes a second.
         from lpac.analysis.write_report import write
 
-        page = write(examined, of.out or of.folders[0] / "report", times_s, tell)
+        page = write(examined, of.out or of.folders[0] / "report", times_s, on_progress)
     if of.as_json:
         typer.echo(json.dumps(examined.summary(), indent=2))
         return

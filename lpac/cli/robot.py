@@ -128,10 +128,10 @@ def setup(
     show("error")
     with vehicle_lock(port_of(url)), MavsdkAutopilot(url) as autopilot:
         report = set_up(autopilot, autopilot, requirements, system_id, wait)
-    _tell_setup(report, as_json=as_json)
+    _print_setup(report, as_json=as_json)
 
 
-def _tell_setup(report: "SetupReport", *, as_json: bool) -> None:
+def _print_setup(report: "SetupReport", *, as_json: bool) -> None:
     """Print the report. Raises ValueError if there are problems."""
     if as_json:
         typer.echo(json.dumps(report._asdict(), indent=2))
@@ -140,6 +140,6 @@ def _tell_setup(report: "SetupReport", *, as_json: bool) -> None:
     if report.problems:
         raise ValueError("the vehicle is not safe to fly as it is")
     if report.needs_reboot:
-        typer.echo("restart the autopilot: only then all of it counts", err=as_json)
+        typer.echo("restart the autopilot: some changes take effect only then", err=as_json)
     elif not report.changes:
-        typer.echo("all was so already", err=as_json)
+        typer.echo("nothing had to be changed", err=as_json)

@@ -26,7 +26,7 @@ from lpac.cli.options import (
     VehicleKind,
     check_px4,
 )
-from lpac.cli.printing import lines_of, progress_of
+from lpac.cli.printing import periodic_lines, progress_of
 from lpac.cli.programs import as_many_as_carried, say_if_carried, serve
 from lpac.cli.transport import Transport, WifiFile, calibration, wifi_lines
 
@@ -81,7 +81,7 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightOptions:
-    """Options that are not fields of a scenario as they are."""
+    """Options that are not simply fields of a scenario."""
 
     robots: Annotated[
         str | None,
@@ -96,8 +96,8 @@ class FlightOptions:
     )
     starts: Annotated[
         Path | None,
-        "File with a line 'x y' for each robot, where it starts, m of the mission frame; else that "
-        "follows from the seed.",
+        "File of starts, a line 'x y' for each robot, m in the mission frame; by default drawn "
+        "from the seed.",
     ] = None
     scale: Annotated[Scale, "Points: field: 16 units per m, velocity x 0.25; model: 1 and 1."] = (
         Scale.FIELD
@@ -105,7 +105,7 @@ class FlightOptions:
     perception_hz: Annotated[_Hz, "How often a robot perceives."] = 5.0
     policy_hz: Annotated[
         _Hz,
-        "How often its policy decides, and it speaks: against --perception-hz, the exchanges per "
+        "How often its policy decides and it sends; over --perception-hz, the exchanges per "
         "perception.",
     ] = 2.5
     control_hz: Annotated[_Hz, "How often it steers."] = 10.0
@@ -122,15 +122,14 @@ class FlightOptions:
         list[str] | None,
         typer.Option(
             metavar="ROBOT@FROM-UNTIL",
-            help="A robot that is gone for a while, such as 3@60-80, or that a pilot has if it is "
-            "whole; may be repeated.",
+            help="A robot that is away for a while, such as 3@60-80; a pilot flies it if it is a "
+            "whole robot; may be repeated.",
         ),
     ] = None
     transport: Annotated[
         Transport | None,
-        "point: the radio that such a team would have, by a model of one Wi-Fi channel; mavlink, "
-        "px4: whether robots send their messages to each other (mesh, the default), or to all at "
-        "once.",
+        "point: a team's radio, by a model of one Wi-Fi channel; mavlink, px4: robots send "
+        "messages to each other one by one (mesh, the default), or to all at once (multicast).",
     ] = None
     wifi: WifiFile = None
 
@@ -166,7 +165,7 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
     if run.out:
         run.out.mkdir(parents=True, exist_ok=True)
     if run.vehicle is VehicleKind.POINT:
-        _tell_of_features_outside(drawn.world, scenario.features, run.bundle, scenario.world_size)
+        _warn_of_features_outside(drawn.world, scenario.features, run.bundle, scenario.world_size)
         [record] = fly_showing([(scenario.controller, scenario)], run.bundle)
     elif run.vehicle is VehicleKind.SIMULATED:
         record = _fly_on_clock(scenario, run)
@@ -256,7 +255,7 @@ def _failures(drawn: FlightOptions, robots: int, duration_s: float) -> tuple["Fa
     for failure in failures:
         if failure.from_s >= duration_s:
             raise ValueError(
-                f"robot {failure.robot} is gone from {failure.from_s:g} s on: must be within the "
+                f"robot {failure.robot} is away from {failure.from_s:g} s on: must be within the "
                 f"flight, --duration {duration_s:g}"
             )
     return tuple(failures)
@@ -317,13 +316,13 @@ def fly_showing(scenarios: list[tuple[str, "Scenario"]], bundle: Path) -> list["
 def _fly_on_clock(scenario: "Scenario", run: RunOptions) -> "FlightRecord":
     from lpac.sim.engines import ClockedRobots
 
-    said = ["the fleet is made"]
+    steps = ["the fleet is made"]
 
     def say(text: str) -> None:
-        said.append(text)
+        steps.append(text)
         typer.echo(text, err=True)
 
-    with lines_of(lambda: f"{said[-1]}: still at it"):
+    with periodic_lines(lambda: f"{steps[-1]}: still running"):
         [record] = ClockedRobots(say, run.recorded).fly([scenario], run.bundle, run.out)
     return record
 
@@ -400,7 +399,7 @@ def _show_points(
 
     is_policy = scenario.controller == "lpac"
     flier = loaded_bundle(str(bundle)).manifest.name if is_policy else scenario.controller
-    result = "what there is lies outside of the world, so that there was nothing to cover"
+    result = "all features lie outside of the world, so there was nothing to cover"
     if len(record.normalized):
         result = (
             f"after {record.duration_s:g} s the coverage cost is {record.normalized[-1]:.3f} of "
@@ -424,7 +423,7 @@ def require_something_to_cover(
         raise ValueError(f"{what}: the world would have nothing in it to cover")
 
 
-def _tell_of_features_outside(
+def _warn_of_features_outside(
     world: Path | None,
     features: "Sequence[Feature] | None",
     bundle: Path,

@@ -83,41 +83,41 @@ def fly_study(task: StudyTask, ray: str | None, *, as_json: bool) -> None:
     [report] = fly_together([task], task.folder, ray)
     show_report(report, task.folder, as_json=as_json)
     if not as_json and (opened := report.data["test_set_opened"]) is not None:
-        beside = "if you choose by this, it is no test set any more"
-        typer.echo(f"the test set was opened, {opened['worlds']} worlds of it: {beside}")
+        caveat = "if you select by these results, it is no longer a test set"
+        typer.echo(f"{opened['worlds']} worlds of the test set were used: {caveat}")
 
 
 def fly_together(tasks: Sequence[StudyTask], folder: Path, ray: str | None) -> "list[Report]":
     """Fly studies, each flight once, and write their reports; `folder` stores the flights."""
     from lpac.study.run import run_together
 
-    # Only now: mistakes are reported by then, and workers are forked without matplotlib.
+    # Only now: invalid options are reported first, and workers are forked without matplotlib.
     cores = pool(ray)
     folder.mkdir(parents=True, exist_ok=True)
     by_name = {task.name: task for task in tasks}
     studies = {name: task.study for name, task in by_name.items()}
     flown, reports = {}, {}
-    with folder_lock("the study", folder), telling("flights") as tell:
-        for name, its in run_together(studies, cores, folder, tell):
+    with folder_lock("the study", folder), progress_counter("flights") as on_progress:
+        for name, done in run_together(studies, cores, folder, on_progress):
             # Draw while the others fly.
-            flown[name], reports[name] = its, _written(by_name[name], its)
+            flown[name], reports[name] = done, _write_report(by_name[name], done)
     for name, task in by_name.items():
         if "worst" in task.study.figures:
             from lpac.study.summary import draw_worst
 
-            with telling("pictures of the worst worlds") as tell:
-                draw_worst(task.study, flown[name].results, task.folder, cores, tell)
+            with progress_counter("pictures of the worst worlds") as on_progress:
+                draw_worst(task.study, flown[name].results, task.folder, cores, on_progress)
     return [reports[name] for name in by_name]
 
 
-def _written(task: StudyTask, flown: "Flown") -> "Report":
-    """Write the report to its folder."""
+def _write_report(task: StudyTask, flown: "Flown") -> "Report":
+    """Write a study's report to its folder."""
     from lpac.study.provenance import made_by_study
     from lpac.study.summary import report_of
 
     study, folder = task.study, task.folder
     made_by = made_by_study(task.command or shlex.join(sys.argv[1:]), study)
-    further = {"test_set_opened": _opened(study), **task.further}
+    further = {"test_set_opened": _test_set_use(study), **task.further}
     report = report_of(task.name, study, flown, folder, made_by, further, compared=task.compared)
     report.write(folder)
     return report
@@ -139,18 +139,18 @@ def show_report(report: "Report", folder: Path, *, as_json: bool = False) -> Non
 
 
 @contextmanager
-def telling(what: str) -> "Iterator[Callable[..., None]]":
-    """Progress on stderr, from `tell(done, of)` or `tell(done, of, said)`."""
+def progress_counter(what: str) -> "Iterator[Callable[..., None]]":
+    """Progress on stderr, from calls with the numbers done and planned, and perhaps a remark."""
     with progress_of(what) as progress:
         task = progress.add_task("", total=None)
 
-        def tell(done: int, of: int, said: str = "") -> None:
-            progress.update(task, completed=done, total=of, description=said)
+        def on_progress(done: int, planned: int, remark: str = "") -> None:
+            progress.update(task, completed=done, total=planned, description=remark)
 
-        yield tell
+        yield on_progress
 
 
-def _opened(study: "Study") -> dict[str, Any] | None:
+def _test_set_use(study: "Study") -> dict[str, Any] | None:
     """Use of the test set: date, bundles and number of worlds; None for other sets."""
     if study.world_set != "test":
         return None

@@ -40,23 +40,23 @@ def train(
     read = read_config(config)
     cores = pool(ray)
     folder = out or _OUT / read.config.export.name
-    with folder_lock("the training", folder), _progress() as tell:
-        told = TrainingRun(read, folder, tell).run(cores)
+    with folder_lock("the training", folder), _progress() as on_progress:
+        results = TrainingRun(read, folder, on_progress).run(cores)
     if as_json:
-        typer.echo(json.dumps(told, indent=2))
+        typer.echo(json.dumps(results, indent=2))
     else:
-        _show(told)
+        _show(results)
 
 
 @contextmanager
 def _progress() -> "Iterator[Callable[[RunProgress], None]]":
     with progress_of_run() as show:
 
-        def tell(now: "RunProgress") -> None:
+        def on_progress(now: "RunProgress") -> None:
             numbers = [*numbers_of_training(now), *time_left(now.left_s)]
             show(now.done, f"round {now.round}: {now.stage}", numbers)
 
-        yield tell
+        yield on_progress
 
 
 def numbers_of_training(now: "RunProgress") -> list[str]:
@@ -65,17 +65,18 @@ def numbers_of_training(now: "RunProgress") -> list[str]:
     return loss if now.cost is None else [*loss, f"closed-loop cost {now.cost:.3f}"]
 
 
-def _show(told: dict[str, Any]) -> None:
+def _show(results: dict[str, Any]) -> None:
+    selected = results["selected"]
     rows = [
         [name, *(f"{cost[key]:.3f}" for key in ("mean", "p90", "worst"))]
-        for name, cost in ((told["bundle"], told["selected"]), *told["baselines"].items())
+        for name, cost in ((results["bundle"], selected), *results["baselines"].items())
     ]
     typer.echo("validation worlds: cost at the end over that at the start\n")
     print_table(("", "mean", "p90", "worst"), rows, right=("mean", "p90", "worst"))
-    hours = told["hours"]
+    hours = results["hours"]
     typer.echo(
-        f"\nround {told['selected']['round']}, epoch {told['selected']['epoch']}, of "
-        f"{len(told['candidates'])} candidates; {told['states']} states; hours: "
+        f"\nround {selected['round']}, epoch {selected['epoch']}, of "
+        f"{len(results['candidates'])} candidates; {results['states']} states; hours: "
         f"{hours['generate_cpu']:.2f} CPU to generate, {hours['fit']:.2f} to fit, "
-        f"{hours['select']:.2f} to select\nsee {told['folder']}: README.md, the model card"
+        f"{hours['select']:.2f} to select\nsee {results['folder']}: README.md, the model card"
     )

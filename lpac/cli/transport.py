@@ -55,14 +55,13 @@ def _toml(value: float | bool) -> str:
 
 
 def _text(source: "Source") -> str:
-
     from edge.core.counted import counted
 
-    said = {
+    origin = {
         "assumed": "assumed",
         "file": "from the file",
         "rates": "from the radios' rates",
         "busy": "from how busy the channel was",
         "delivered": "from what multicast delivered",
     }[source.kind.value]
-    return f"{said}, {counted(source.records, 'record')}" if source.records else said
+    return f"{origin}, {counted(source.records, 'record')}" if source.records else origin

@@ -80,8 +80,8 @@ def _look(fleet: str) -> tuple["FleetSetup", "FleetSnapshot"]:
     from lpac.ground.station.client import subscribe
 
     setup = None
-    with subscribe(fleet) as told:
-        for answer in told:
+    with subscribe(fleet) as answers:
+        for answer in answers:
             if isinstance(answer, FleetSetup):
                 setup = answer
             elif isinstance(answer, FleetSnapshot) and setup is not None:

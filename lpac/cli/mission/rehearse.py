@@ -113,13 +113,13 @@ def _line(row: "list[Text]") -> str:
     if len(cells) < len(_HEADINGS) - 1:
         return f"{robot}: {cells[0]}"
     x, y, nose, fence_m, arrow, words = cells
-    told = [
+    parts = [
         f"x {x} m, y {y} m" if y else x,
         f"nose {nose}" if nose else "",
         f"inside the fence by {fence_m} m" if fence_m else "",
         f"commanded: {arrow} {words}".rstrip(),
     ]
-    return f"{robot}: {', '.join(filter(None, told))}"
+    return f"{robot}: {', '.join(filter(None, parts))}"
 
 
 def _rows(subscriber: "GroundSubscriber", names: "Sequence[str]") -> list[list["Text"]]:

@@ -102,7 +102,7 @@ class _View:
         self._step, self._step_began_s = "", time.monotonic()
         self._at_most_s: float | None = None
         # A live view on a terminal would capture the JSON on stdout.
-        self._view = LiveView(self._render, self._how_far, live=not as_json)
+        self._view = LiveView(self._render, self._status_line, live=not as_json)
         self.shown, self.line = self._view.shown, self._view.line
 
     def step(self, name: str, at_most_s: float | None) -> None:
@@ -127,7 +127,7 @@ class _View:
         with self._view.paused():
             return typer.confirm(question, err=True)
 
-    def _how_far(self) -> str:
+    def _status_line(self) -> str:
         """One line: the step, and the robots' states."""
         states = Counter(
             "not heard" if robot.status is None or not robot.fresh else robot.status.state.value

@@ -117,7 +117,7 @@ def test_it_runs_without_a_user_and_a_place_to_write(
     result = run_inside(tree, tmp_path, "sim")
     assert result.returncode == 1
     assert result.stderr == (
-        "lpac: lpac.cli.sim is not installed here: this command is the workstation's\n"
+        "lpac: lpac.cli.sim is not installed here: this command is for a workstation\n"
     )
     result = run_inside(tree, tmp_path, "bundle", "verify", "/release")
     assert (result.returncode, result.stderr) == (0, "")

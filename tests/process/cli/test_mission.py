@@ -107,7 +107,5 @@ def test_ctrl_c_ends_a_script_and_no_return_and_kill_asks(
                 _, err = process.communicate(timeout=60.0)
             assert process.returncode == 130
             last = err.splitlines()[-1]
-            assert (
-                last == "lpac: return: interrupted: robots that were told to return go on with it"
-            )
+            assert last == "lpac: return: interrupted: robots that were ordered to return do so"
             until(lambda: states()[0] is _S.LANDED)

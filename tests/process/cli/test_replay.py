@@ -118,7 +118,7 @@ def test_logs_of_the_version_before_say_that_they_hold_no_flight(
 ) -> None:
     result = lpac("replay", write_log(tmp_path, shipped_bundle, flown))
     assert result.returncode == 0, result.stderr
-    assert "robot-0-0001 holds nothing that its flight was decided by" in result.stdout
+    assert "robot-0-0001 has no inputs of flight decisions" in result.stdout
 
 
 def test_another_place_for_the_bundle(

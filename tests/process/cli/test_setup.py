@@ -34,7 +34,7 @@ def test_all_that_decides_about_safety_is_set_and_then_was_so_already(tmp_path: 
             "system_id": SYSTEM_ID, "changes": [], "problems": [], "needs_reboot": True,
         }  # fmt: skip
         made.vehicle.parameters["MAV_SYS_ID"] = SYSTEM_ID
-        assert setup(url, SYSTEM_ID)[:2] == (0, "all was so already\n")
+        assert setup(url, SYSTEM_ID)[:2] == (0, "nothing had to be changed\n")
 
 
 def test_nothing_is_set_on_an_armed_vehicle_nor_where_there_are_two(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def test_what_ends_it_is_one_line(tmp_path: Path) -> None:
         os.killpg(process.pid, signal.SIGINT)
         _, told = process.communicate()
     assert process.returncode == 130 and told.strip().endswith(
-        "lpac: interrupted: the same command goes on"
+        "lpac: interrupted: the same command continues"
     )
 
 

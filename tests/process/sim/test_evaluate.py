@@ -68,7 +68,7 @@ def test_it_says_what_its_columns_are_and_how_many_worlds_would_tell(
     for column in ("J / J(0)", "p90", "worst", "area", "vs clairvoyant", "vs best Lloyd"):
         assert f"{column}: " in LEGEND
     assert VERDICT_RULE in LEGEND and all(line in readme for line in LEGEND.splitlines())
-    assert "not told apart" in readme and "undecided" not in readme
+    assert "not distinguishable" in readme and "undecided" not in readme
     plain = {**told, "conditions": told["conditions"][:1]}
     policy, prior, _ = plain["conditions"][0]["results"]
     plain["conditions"] = [{**plain["conditions"][0], "compared": policy["against"][prior["name"]]}]
@@ -155,7 +155,7 @@ def test_interrupted_it_is_one_line(tmp_path: Path) -> None:
         os.killpg(interrupted.pid, signal.SIGINT)
         _, said = interrupted.communicate()
     assert interrupted.returncode == 130 and said.strip().endswith(
-        "lpac: interrupted: the same command goes on"
+        "lpac: interrupted: the same command continues"
     )
 
 
@@ -168,7 +168,7 @@ def test_whether_one_is_better(tmp_path: Path) -> None:
     )  # fmt: skip
     assert result.returncode == 0, (result.stdout, result.stderr)
     assert "clairvoyant-cvt is better than decentralized-cvt: cost at the end 0." in result.stdout
-    assert "the test set was opened, 6 worlds of it" in result.stdout
+    assert "6 worlds of the test set were used" in result.stdout
     told = json.loads((tmp_path / "evaluation.json").read_text())
     assert told["test_set_opened"].keys() == {"date", "bundle_ids", "worlds"}
     assert told["conditions"][0]["compared"]["better"] == "a"

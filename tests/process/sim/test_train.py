@@ -76,7 +76,7 @@ def test_what_ends_it_is_one_line_and_loses_nothing(config: Path, tmp_path: Path
         os.killpg(process.pid, signal.SIGCONT)
         _, told = process.communicate()
     assert process.returncode == 130 and told.strip().endswith(
-        "lpac: interrupted: the same command goes on"
+        "lpac: interrupted: the same command continues"
     )
     before = {path: path.read_bytes() for path in (out / "data").glob("*-*.npz")}
 

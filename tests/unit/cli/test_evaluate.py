@@ -22,7 +22,7 @@ from tests.conftest import SHIPPED
         ({"lost": ["2"]}, "lost = '2': must be ROBOTS@SECONDS, such as 2@20"),
         ({"lost": ["2@60"]}, "lost = 2@60: must be in flight"),
         ({"losses": [1.5]}, "loss = 1.5: must be from 0 to 1"),
-        ({"transports": ["mesh"], "losses": [0.1]}, "--loss and --transport: the model itself"),
+        ({"transports": ["mesh"], "losses": [0.1]}, "--loss and --transport: the model of"),
         ({"wifi": Path("wifi.toml")}, "--wifi does nothing without --transport"),
         ({"transports": ["mesh"], "wifi": Path("w.yaml")}, "w.yaml: must be a .toml file"),
         ({"worlds": 0}, "--worlds = 0: must be at least 1"),

@@ -86,6 +86,6 @@ def test_replay_goes_on_and_does_not_say_that_all_is_as_it_was(
     assert "robot-0-0001.mcap: was not written by a robot" in err and "left out" in err
     shutil.copy(RECORDED, bad)
     damage(bad, 0)
-    with pytest.raises(ValueError, match=r"not all could be run again: robot-0-0003\.mcap"):
+    with pytest.raises(ValueError, match=r"not all could be replayed: robot-0-0003\.mcap"):
         replay([tmp_path])
     assert f"{bad}: is damaged: holds nothing from" in capsys.readouterr().err

@@ -12,7 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from lpac.cli.apps import CommandList
-from lpac.cli.main import _EXTRAS, _what_is_missing, app
+from lpac.cli.main import _EXTRAS, _missing_package, app
 from lpac.extras import install_command
 from tests.conftest import ROOT
 
@@ -53,7 +53,7 @@ def test_a_command_that_a_robot_does_not_have_is_not_listed(
     with pytest.raises(SystemExit) as ended:
         LISTED(["sim"], standalone_mode=False)
     assert ended.value.code == (
-        "lpac: lpac.cli.sim is not installed here: this command is the workstation's"
+        "lpac: lpac.cli.sim is not installed here: this command is for a workstation"
     )
 
 
@@ -73,7 +73,7 @@ def test_a_mistyped_command_is_told_the_nearest() -> None:
 @pytest.mark.parametrize(
     ("command", "said"),
     [
-        ("train", "lpac: interrupted: the same command goes on"),
+        ("train", "lpac: interrupted: the same command continues"),
         ("sim", "lpac: interrupted"),
     ],
 )
@@ -121,4 +121,4 @@ def test_an_error_of_the_program_is_no_missing_install() -> None:
 
 
 def _missing(module: str, command: str) -> str:
-    return _what_is_missing(ModuleNotFoundError(module, name=module), command)
+    return _missing_package(ModuleNotFoundError(module, name=module), command)

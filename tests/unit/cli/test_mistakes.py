@@ -30,7 +30,7 @@ from tests.conftest import SHIPPED
         (["sim", "--policy-hz", "0"], "--policy-hz = 0.0: must be from 0.1 to 100"),
         (["sim", "--position-error", "-1"], "--position-error = -1.0: must be at least 0"),
         (["sim", "--lost", "10@5"], "lost robots 10@5: must be fewer than the team's 10"),
-        (["sim", "--lost", "2@60"], "robot 8 is gone from 60 s on: must be within the flight"),
+        (["sim", "--lost", "2@60"], "robot 8 is away from 60 s on: must be within the flight"),
         (["sim", "--range", "0"], "--range = 0.0: must be above 0 and finite"),
         (["sim", "--secure"], "--secure does nothing with --vehicle point"),
         (["sim", "--no-script"], "--no-script does nothing with --vehicle point"),
