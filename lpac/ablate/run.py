@@ -90,7 +90,7 @@ class AblationRun:
             share = (len(trainings) + done / of) / (len(trainings) + 1)
             self._report(AblationProgress(f"flight {done} of {of}", share, None, None))
 
-        return results_of(self._ablation, run(study, pool, folder=self._folder, tell=report))
+        return results_of(self._ablation, run(study, pool, folder=self._folder, on_progress=report))
 
     def _bundle(self, training: PlannedTraining) -> TrainedBundle:
         path = self._folder / training.name / training.name

@@ -50,7 +50,7 @@ def _worst(outcomes: Iterable[FlightOutcome]) -> tuple[Figure, ...]:
     return tuple(min(column, key=lambda figure: figure.room) for column in columns)
 
 
-def flown_again_by(flight: PlannedFlight) -> str:
+def repeat_command(flight: PlannedFlight) -> str:
     """Command line that repeats a flight."""
     scenario = flight.scenario
     words = ["lpac", "drill", "--fault", flight.scenario.fault, "--seed", str(scenario.seed)]
@@ -85,7 +85,7 @@ def report_of(outcomes: Outcomes, made_by: Mapping[str, str]) -> Report:
     ]
     for flight, outcome in broken.items():
         note += [f"{flight.scenario.fault}, seed {flight.scenario.seed}: {_why(outcome)}"]
-        note += [f"    {flown_again_by(flight)}"]
+        note += [f"    {repeat_command(flight)}"]
     first = next(iter(outcomes))
     late_s = max(outcome.late_s for outcome in outcomes.values())
     if first.engine != "simulated":
@@ -143,7 +143,7 @@ def _json(outcomes: Outcomes) -> dict[str, Any]:
                 "error": outcome.error,
                 "late_s": round(outcome.late_s, 2),
                 "figures": [_figure_json(figure) for figure in outcome.broken],
-                "again": flown_again_by(flight),
+                "again": repeat_command(flight),
             }
             for flight, outcome in outcomes.items()
             if not outcome.held
@@ -175,7 +175,7 @@ def as_junit(outcomes: Outcomes) -> bytes:
         if not outcome.held:
             failure = ElementTree.SubElement(case, "failure", message=_why(outcome))
             failure.text = (
-                f"promised: {FAULTS[flight.scenario.fault].promise}\n{flown_again_by(flight)}"
+                f"promised: {FAULTS[flight.scenario.fault].promise}\n{repeat_command(flight)}"
             )
     xml: bytes = ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True)
     return xml

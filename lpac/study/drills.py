@@ -32,7 +32,7 @@ DrillEngine = Literal["simulated", "mavlink", "px4"]
 _CORES_EACH = 0.16
 
 # Called with the numbers of flights done and planned, and a remark.
-Tell = Callable[[int, int, str], object]
+OnProgress = Callable[[int, int, str], object]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +120,7 @@ def fly_drill(
     flights: Sequence[PlannedFlight],
     folder: Path,
     pool: Pool = in_this_process,
-    tell: Tell = lambda *_: None,
+    on_progress: OnProgress = lambda *_: None,
 ) -> dict[PlannedFlight, FlightOutcome]:
     """Fly the flights without a stored outcome in `folder`; returns all, by fault, then seed.
 
@@ -141,7 +141,7 @@ def fly_drill(
         for flight, outcome in flown:
             outcomes[flight] = outcome
             broken += not outcome.held
-            tell(len(outcomes), len(flights), f"{broken} broke a promise" if broken else "")
+            on_progress(len(outcomes), len(flights), f"{broken} broke a promise" if broken else "")
     places = {name: place for place, name in enumerate(FAULTS)}
     in_order = sorted(
         flights, key=lambda flight: (places[flight.scenario.fault], flight.scenario.seed)

@@ -173,9 +173,9 @@ def fly_all(
     groups: dict[bool, list[FlightGroup]] = {False: [], True: []}
     for group in sorted(groups_of(flights), key=_robot_seconds, reverse=True):
         groups[group[0].engine in IN_REAL_TIME].append(group)
-    for its_pool, its in ((pool, groups[False]), (in_real_time, groups[True])):
-        if its:
-            with closing(its_pool(do, its)) as flown:
+    for group_pool, members in ((pool, groups[False]), (in_real_time, groups[True])):
+        if members:
+            with closing(group_pool(do, members)) as flown:
                 yield from chain.from_iterable(flown)
 
 

@@ -1,4 +1,4 @@
-"""Flights in which robots are taken away and brought back."""
+"""Flights in which robots are removed and brought back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class Phase(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PerturbedFlight:
-    """A flight from which robots were taken, sampled at times (T,), s.
+    """A flight from which robots were removed, sampled at times (T,), s.
 
     `speed_m_s` and `neighbours` are (T, N), NaN while a robot is away.
     """
@@ -116,17 +116,17 @@ def _phase(
     before, inside = cost[times_s < from_s], (times_s >= from_s) & (times_s < until_s)
     if not inside.any() or not len(before):
         return None
-    its_s, its = times_s[inside], cost[inside]
-    off = np.flatnonzero(np.abs(its / its[-1] - 1.0) > _SETTLED)
+    phase_s, costs = times_s[inside], cost[inside]
+    off = np.flatnonzero(np.abs(costs / costs[-1] - 1.0) > _SETTLED)
     return Phase(
         robot=robot,
         away=away,
         from_s=from_s,
         until_s=until_s,
         cost_before=float(before[-1]),
-        cost_worst=float(its.max()),
-        cost_end=float(its[-1]),
-        settled_s=float(its_s[off[-1]] - from_s) if len(off) else 0.0,
+        cost_worst=float(costs.max()),
+        cost_end=float(costs[-1]),
+        settled_s=float(phase_s[off[-1]] - from_s) if len(off) else 0.0,
     )
 
 

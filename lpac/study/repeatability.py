@@ -11,7 +11,7 @@ from edge.messages.mission import FlightState
 from lpac.analysis.flight import COST_PERIOD_S, FlightRecord
 
 
-def looked_at_from_s(trials: Mapping[str, FlightRecord], duration_s: float) -> dict[str, float]:
+def evaluation_start_s(trials: Mapping[str, FlightRecord], duration_s: float) -> dict[str, float]:
     """Start of the evaluated time of each trial, by name; s, in the trial's own time.
 
     The start is the takeoff command. It is 0, the mission's start, for all trials if one of them
@@ -34,7 +34,7 @@ def _takeoff_s(record: FlightRecord) -> float:
     return min(armed_s, default=math.nan)
 
 
-def looked_at(record: FlightRecord, from_s: float, duration_s: float) -> FlightRecord:
+def evaluated_part(record: FlightRecord, from_s: float, duration_s: float) -> FlightRecord:
     """Part of a trial of at most `duration_s`, with times relative to `from_s`.
 
     Before the mission, robots on the ground also count for the cost.
@@ -90,8 +90,8 @@ def spread_of(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
     }
 
 
-def who_is_missing(spread: Mapping[str, Any]) -> list[str]:
-    """A sentence for each trial of `spread_of` with missing robots."""
+def not_compared(spread: Mapping[str, Any]) -> list[str]:
+    """A sentence for each trial of `spread_of` that lacks robots."""
     return [
         f"Not compared, because not in the air at the end of {trial}: {', '.join(names)}."
         for trial, names in spread["missing"].items()

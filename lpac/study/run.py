@@ -1,4 +1,4 @@
-"""Studies, flown."""
+"""Fly studies, over several cores, and store what was flown."""
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -20,11 +20,11 @@ from lpac.study.flights import (
 from lpac.study.results import MethodResult, results_of
 from lpac.study.study import Condition, Study
 
-Tell = Callable[[int, int], object]
+OnProgress = Callable[[int, int], object]
 
 
 class Flown(NamedTuple):
-    """Of a study, under each condition each method's result, and the records if it needs them."""
+    """A study's results by condition and method, and its flights' records if it needs them."""
 
     results: dict[Condition, list[MethodResult]]
     records: dict[PlannedFlight, FlightRecord]
@@ -35,14 +35,14 @@ def run(
     pool: Pool = in_this_process,
     *,
     folder: Path | None = None,
-    tell: Tell = lambda *_: None,
+    on_progress: OnProgress = lambda *_: None,
 ) -> dict[Condition, list[MethodResult]]:
-    """Fly all of it: under each condition each method's result, in the study's order.
+    """Fly a study; returns each method's result under each condition, in the study's order.
 
-    With `over_cores` as `pool` all cores fly; a script must then begin what it does below
-    `if __name__ == "__main__":`. Flights in real time go one after another, whatever the pool. A
-    `folder` keeps what was flown: whoever asks again, of this code, waits for the rest only. `tell`
-    gets how many flights are done, and of how many.
+    With `over_cores` as `pool`, all cores fly; a script must then guard its code with
+    `if __name__ == "__main__":`. Flights in real time run one after another with any pool. A
+    `folder` stores outcomes, so that a repeated run of the same code flies only the rest.
+    `on_progress` is called with the numbers of flights done and planned.
 
     Raises BundleError, ValueError, and OSError if the folder cannot be written.
     """
@@ -51,18 +51,18 @@ def run(
     with closing(_flown(flights, frozenset(), pool, folder)) as flown:
         for flight, (curve, _) in flown:
             curves[flight] = curve
-            tell(len(curves), len(flights))
+            on_progress(len(curves), len(flights))
     return results_of(study, curves)
 
 
 def run_together(
-    studies: Mapping[str, Study], pool: Pool, folder: Path, tell: Tell
+    studies: Mapping[str, Study], pool: Pool, folder: Path, on_progress: OnProgress
 ) -> Iterator[tuple[str, Flown]]:
-    """As `run`, of several studies: each, by its name, once all of it is flown.
+    """Fly several studies as `run` does; yields each with its name once all its flights are done.
 
-    What two of them fly is flown once, and nobody waits for one before the next is begun. With the
-    record of each flight if a study's figures are of these. Records are not kept: they are flown
-    again. Programs in real time leave their logs in `folder`.
+    Flights that studies share are flown once, and no study waits for another. Records are included
+    for studies whose figures need them. They are not stored, so these flights are flown again.
+    Programs in real time leave their logs in `folder`.
     """
     missing = {name: set(study.flights()) for name, study in studies.items()}
     whole = frozenset(f for name, s in studies.items() if s.needs_records for f in missing[name])
@@ -74,7 +74,7 @@ def run_together(
             curves[flight] = curve
             if record is not None:
                 records[flight] = record
-            tell(len(curves), len(flights))
+            on_progress(len(curves), len(flights))
             for name, study in studies.items():
                 if missing[name] == {flight}:
                     own = study.flights() if study.needs_records else ()
@@ -93,7 +93,7 @@ def _flown(
     pool: Pool,
     folder: Path | None,
 ) -> Generator[tuple[PlannedFlight, _Outcome], None, None]:
-    """Each flight as it comes, those that are `whole` with their records."""
+    """Yield the outcome of each flight when it ends, with its record if it is in `whole`."""
     kept = KeptFlights(folder, CostCurve) if folder else None
     known = kept.known(flight for flight in flights if flight not in whole) if kept else {}
     for flight, curve in known.items():
@@ -109,7 +109,7 @@ def _flown(
 def _outcomes_of(
     group: FlightGroup, whole: frozenset[PlannedFlight], logs: Path | None
 ) -> list[tuple[PlannedFlight, _Outcome]]:
-    """Fly them, in whatever process this is, which also computes the costs."""
+    """Fly a group and compute its costs, in any process."""
     flown = records_of(group, logs if group[0] in whole else None)
     return [
         (flight, _Outcome(curve_of(flight, record), record if flight in whole else None))

@@ -1,4 +1,4 @@
-"""Sections of a report on whole flights: each is a figure or two, a table, and numbers."""
+"""Sections of a report on whole flights: figures, a table, and numbers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,28 +8,26 @@ from typing import Any
 import numpy as np
 
 from edge.core import F64
+from edge.core.counted import counted
 from lpac.analysis import figures as flight_figures
 from lpac.analysis import style
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.statistics import finite
 from lpac.study import figures
 from lpac.study.perturbation import PerturbedFlight
-from lpac.study.repeatability import looked_at, looked_at_from_s, spread_of, who_is_missing
+from lpac.study.repeatability import evaluated_part, evaluation_start_s, not_compared, spread_of
 from lpac.study.report import Picture, Report, Table, write_csv
 
 _COSTS = (
-    "Costs are divided by that at the start: for points, of their true positions; for whole robots "
-    "and logs, of estimated positions, and of true ones where those are known."
+    "Costs are relative to the initial cost. They are at the true positions of points; at the "
+    "estimated positions of whole robots and in logs, and at true ones where these are known."
 )
 _SNAPSHOTS_S = (0.0, 0.25, 0.5, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Section of a report on flights.
-
-    `data` is for scripts, `rows` are the CSV's, its heading first.
-    """
+    """Section of a report on flights: `data` is for the JSON, `rows` for the CSV, heading first."""
 
     data: Mapping[str, Any]
     tables: Sequence[Table]
@@ -37,7 +35,7 @@ class Section:
     rows: Sequence[Sequence[object]]
 
     def report(self, name: str, title: str, flown: str, made_by: Mapping[str, str]) -> Report:
-        """A report of this alone; `flown` and `made_by` are `Report`'s."""
+        """Report with this section only; `flown` and `made_by` are `Report`'s."""
         return Report(
             name=name, title=title, text=flown, data=self.data, rows=self.rows,
             tables=self.tables, figures=self.figures, flown=flown, made_by=made_by,
@@ -45,7 +43,7 @@ class Section:
 
 
 def snapshots(records: Mapping[str, Mapping[str, FlightRecord]], folder: Path) -> Section:
-    """Flights by world, and who flew, of whom the first is drawn. Raises OSError."""
+    """Flights by world and method, of which the first method's are drawn. Raises OSError."""
     first = {world: next(iter(of_world.values())) for world, of_world in records.items()}
     duration_s = min(record.duration_s for record in first.values())
     times_s = [share * duration_s for share in _SNAPSHOTS_S]
@@ -64,44 +62,47 @@ def snapshots(records: Mapping[str, Mapping[str, FlightRecord]], folder: Path) -
     return Section(
         {"flights": {world: curves_json(of_world) for world, of_world in records.items()}},
         [Table(["", *names], rows, "World by world",
-               f"The cost at the end, and in brackets that of the true positions. {_COSTS}")],
+               f"The final cost, and in brackets that at the true positions. {_COSTS}")],
         [Picture("snapshots.png", "snapshots"), Picture("costs.png", "costs")],
         curves_csv(named),
     )  # fmt: skip
 
 
 def repeatability(trials: Mapping[str, FlightRecord], folder: Path, duration_s: float) -> Section:
-    """Trials by name, looked at for so long. Raises OSError; ValueError if nobody was in all."""
-    from_s = looked_at_from_s(trials, duration_s)
-    seen = {name: looked_at(trials[name], from_s[name], duration_s) for name in trials}
+    """Compare trials, by name, over `duration_s`.
+
+    Raises OSError; ValueError if no robot was in the air at the end of all trials.
+    """
+    from_s = evaluation_start_s(trials, duration_s)
+    parts = {name: evaluated_part(trials[name], from_s[name], duration_s) for name in trials}
     first = next(iter(trials.values()))
-    # All of one world: it is drawn below their ends.
-    records = [replace(each, name=name, coverage=first.coverage) for name, each in seen.items()]
-    spread = spread_of(seen)
+    # All trials share one world, which is drawn below the end positions.
+    records = [replace(each, name=name, coverage=first.coverage) for name, each in parts.items()]
+    spread = spread_of(parts)
     style.save(flight_figures.repeatability(records), folder / "repeatability")
     rows = [
         [name, _final(record), f"{0.0 - from_s[name]:.0f} s", _final(trials[name])]
-        for name, record in seen.items()
+        for name, record in parts.items()
     ]
-    headings = ["", f"cost after {spread['end_s']:.0f} s (in truth)", "mission began after",
-                "cost at the mission's end / at its start"]  # fmt: skip
-    begins = "Times count from the mission's start: points have no takeoff, and logs may not have "
-    begins += f"one, or one more than {duration_s:g} s earlier."
+    headings = ["", f"cost after {spread['end_s']:.0f} s (true)", "mission began after",
+                "final / initial cost of the mission"]  # fmt: skip
+    begins = "Times count from the mission's start: points have no takeoff, and logs may have none "
+    begins += f"within the {duration_s:g} s before."
     if any(from_s.values()):
         begins = (
             "Times count from the takeoff command. Robots take off one after another; until the "
-            "mission begins, those on their pads count where they stand."
+            "mission begins, robots on their pads count where they stand."
         )
     note = (
         f"{_COSTS} {begins}\nCosts after {spread['end_s']:.0f} s: mean "
         f"{spread['final_mean']:.3f}, standard deviation {spread['final_deviation']:.3f}; before "
         f"that the deviation is {spread['largest_deviation_in_flight']:.3f} at most. On average a "
         f"robot ends {spread['mean_scatter_of_ends_m']:.2f} m from the mean of its end positions. "
-        f"{' '.join(who_is_missing(spread))}"
+        f"{' '.join(not_compared(spread))}"
     )
     return Section(
         {
-            "trials": curves_json(seen),
+            "trials": curves_json(parts),
             "mission_from_s": {name: 0.0 - at_s for name, at_s in from_s.items()},
             "mission_final": {name: float(trials[name].normalized[-1]) for name in trials},
             "looked_at_s": duration_s,
@@ -109,12 +110,12 @@ def repeatability(trials: Mapping[str, FlightRecord], folder: Path, duration_s: 
         },
         [Table(headings, rows, "Trial by trial", note)],
         [Picture("repeatability.png", "cost of all trials, and where robots end")],
-        curves_csv(seen),
+        curves_csv(parts),
     )
 
 
 def perturbation(flight: PerturbedFlight, folder: Path) -> Section:
-    """A flight from which robots are taken. Raises OSError."""
+    """Section on a flight from which robots are removed. Raises OSError."""
     style.save(figures.perturbation(flight), folder / "perturbation")
     write_csv(curves_csv({"flight": flight.record}), folder / "cost.csv")
     rows = [
@@ -128,17 +129,17 @@ def perturbation(flight: PerturbedFlight, folder: Path) -> Section:
     ]  # fmt: skip
     headings = ["", "when", "cost before", "worst", "at the end", "settled after"]
     note = (
-        f"A robot is taken {len(flight.absences)} times. {_COSTS} The true one is the thin line, "
-        "and is not in this table. Settled: from then on the cost stayed within 5 % of what it "
-        "came to when the next thing happened, or the flight ended. `cost.csv` has the cost over "
-        "time; speeds and neighbours are in the other CSV."
+        f"Robots are removed {counted(len(flight.absences), 'time')}. {_COSTS} The true cost is "
+        "the thin line, and is not in this table. Settled: from then on the cost stayed within 5 % "
+        "of its value at the next event, or at the end of the flight. `cost.csv` has the cost over "
+        "time; the other CSV has speeds and neighbours."
     )
     csv_rows: list[list[object]] = [["time_s", "robot", "speed_m_s", "neighbours"]]
     for time_s, speeds, neighbours in zip(
         flight.time_s.tolist(), flight.speed_m_s, flight.neighbours, strict=True
     ):
-        its = zip(flight.record.robots, speeds.tolist(), neighbours.tolist(), strict=True)
-        csv_rows += [[time_s, robot.name, speed, heard] for robot, speed, heard in its]
+        states = zip(flight.record.robots, speeds.tolist(), neighbours.tolist(), strict=True)
+        csv_rows += [[time_s, robot.name, speed, count] for robot, speed, count in states]
     return Section(
         {
             "flight": curves_json({"": flight.record})[""],
@@ -155,22 +156,21 @@ def perturbation(flight: PerturbedFlight, folder: Path) -> Section:
 
 
 def _final(record: FlightRecord) -> str:
-    """With the true one in brackets where vehicles tell."""
+    """Final cost, and in brackets that at true positions if known."""
     curve = curves_json({"": record})[""]
     known = record.truth and curve["final_true"] is not None
     return f"{curve['final']:.3f}" + (f" ({curve['final_true']:.3f})" if known else "")
 
 
 def true_curve(record: FlightRecord) -> F64:
-    """(C,): the cost for where the robots truly were, over the first; NaN where it is not known."""
+    """Cost (C,) at true positions over the initial cost; NaN where unknown."""
     return record.normalized if record.of_points else record.normalized_true
 
 
 def curves_json(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
-    """Of each flight, by name: its cost and its true cost over those at the start.
+    """Costs and true costs of each flight, by name, over the initial ones; None where unknown.
 
-    A true cost that is not known is None. The positions are of who was in the air in the end, by
-    robot, as the record has them.
+    Final positions are by robot, of the robots in the air at the end, as in the record.
     """
     return {
         name: {
@@ -186,7 +186,7 @@ def curves_json(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
 
 
 def curves_csv(records: Mapping[str, FlightRecord]) -> list[list[object]]:
-    """A heading, and a row for each flight and time; a true cost that is not known is empty."""
+    """CSV rows: a heading, then one per flight and time. An unknown true cost is empty."""
     rows: list[list[object]] = [["flight", "time_s", "cost_over_first", "true_cost_over_first"]]
     for name, curve in curves_json(records).items():
         curves = (curve["time_s"], curve["normalized_cost"], curve["normalized_true_cost"])

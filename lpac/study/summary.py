@@ -22,7 +22,7 @@ from lpac.study.perturbation import absences_in, absences_of, perturbed_by
 from lpac.study.receiving_robot import message_bytes
 from lpac.study.report import Picture, Report, Table
 from lpac.study.results import MethodResult, as_json, worst_worlds
-from lpac.study.run import Flown, Tell
+from lpac.study.run import Flown, OnProgress
 from lpac.study.sections import Section, perturbation, repeatability, snapshots
 from lpac.study.study import USUAL_FIGURES, Condition, Draw, Figure, Study
 
@@ -53,12 +53,12 @@ _COLUMNS = (
 # Explains the columns and the rule of comparison, once below all tables.
 LEGEND = (
     "J / J(0): final cost over initial cost: its mean over the worlds, with the 95 % interval; "
-    "p90: nine worlds of ten end below; worst: the worst world\n"
+    "p90: nine worlds in ten end below; worst: the worst world\n"
     "area: mean of J / J(0) over the flight\n"
     "vs clairvoyant: ratio to Lloyd's algorithm with knowledge of the world, of means and, world "
     "by world, p90\n"
     "vs best Lloyd: ratio to the best of ten such runs, in each world\n"
-    f"{VERDICT_RULE}; otherwise they are not told apart"
+    f"{VERDICT_RULE}; otherwise they are not distinguishable"
 )
 
 
@@ -144,7 +144,7 @@ def _share(data: Mapping[str, Any]) -> str:
 def _against(policy: Mapping[str, Any], baseline: str) -> str:
     """Text of the comparison with a baseline, and the share of worlds above it."""
     above, verdict = policy["above"][baseline], policy["against"][baseline]
-    text = {"a": "better", "b": "worse", None: "not told apart"}[verdict["better"]]
+    text = {"a": "better", "b": "worse", None: "not distinguishable"}[verdict["better"]]
     return f"{text}, above it in {100.0 * above['share']:.3g} %"
 
 
@@ -197,16 +197,16 @@ def report_of(
         legend=LEGEND if of_conditions else "",
         data={**data, **further},
         rows=next((section.rows for section in sections), rows_of(data)),
-        tables=[*(table for its in sections for table in its.tables), *of_conditions],
-        figures=[picture for its in sections for picture in its.figures]
+        tables=[*(table for section in sections for table in section.tables), *of_conditions],
+        figures=[picture for section in sections for picture in section.figures]
         + draw_conditions(flown.results, folder, study.figures),
         flown=flown_as(study),
-        beside=_worst_in_words(study) if "worst" in study.figures else "",
+        beside=_worst_pictures(study) if "worst" in study.figures else "",
         made_by=made_by,
     )
 
 
-def _worst_in_words(study: Study) -> str:
+def _worst_pictures(study: Study) -> str:
     """Text about the pictures; "" if no policy flies under the first condition."""
     condition = study.conditions[0]
     policies = [method.name for method in study.methods_of(condition) if method.trained]
@@ -318,7 +318,7 @@ def draw_worst(
     results: Mapping[Condition, Sequence[MethodResult]],
     folder: Path,
     pool: Pool,
-    tell: Tell = lambda *_: None,
+    on_progress: OnProgress = lambda *_: None,
 ) -> None:
     """Fly the worst worlds of each policy under the first condition again, and draw them.
 
@@ -340,16 +340,16 @@ def draw_worst(
     for (name, place, world), pair in wanted.items():
         path = folder / "worst" / name.replace("/", "-") / f"{place:02d}-world-{world}"
         line = {"picture": str(path.relative_to(folder)), "of": [flight.key for flight in pair]}
-        newest = [its for its in drawn.lines if its["picture"] == line["picture"]][-1:]
+        newest = [each for each in drawn.lines if each["picture"] == line["picture"]][-1:]
         if newest != [line] or not path.with_suffix(".png").exists():
             missing.append((name, path, line, pair))
     flights = list(dict.fromkeys(flight for *_, pair in missing for flight in pair))
     flown: dict[PlannedFlight, FlightRecord] = {}
-    of = len(flights) + len(missing)
+    planned = len(flights) + len(missing)
     for flight, record in fly_all(records_of, flights, pool):
         flown[flight] = record
-        tell(len(flown), of)
+        on_progress(len(flown), planned)
     for done, (name, path, line, (own, best)) in enumerate(missing, 1):
         style.save(snapshots_and_costs({name: flown[own], CLAIRVOYANT: flown[best]}), path)
         drawn.add(line)
-        tell(len(flown) + done, of)
+        on_progress(len(flown) + done, planned)

@@ -39,7 +39,7 @@ def test_the_clairvoyant_is_always_there() -> None:
 
 def test_a_folder_keeps_what_was_flown(tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
-    [results] = run(STUDY, tell=lambda *done: told.append(done)).values()
+    [results] = run(STUDY, on_progress=lambda *done: told.append(done)).values()
     flights = len(STUDY.flights())
     assert told == [(number, flights) for number in range(1, flights + 1)]
     assert results[0].curves.shape == (1, 2, 2)

@@ -18,7 +18,7 @@ from lpac.sim.engines import EngineName, engine_of
 from lpac.sim.failure import Failure
 from lpac.sim.scenario import Scenario
 from lpac.study.perturbation import absences_in, absences_of, perturbed_by
-from lpac.study.repeatability import spread_of, who_is_missing
+from lpac.study.repeatability import not_compared, spread_of
 from lpac.study.sections import Section, perturbation, repeatability, snapshots
 
 MADE_BY = {"command": "lpac paper ..."}
@@ -134,7 +134,7 @@ def test_trials_of_different_teams_are_compared_by_name() -> None:
     trials = {"trial 1": first, "trial 2": replace(second, robots=second.robots[3:])}
     spread = spread_of(trials)
     assert spread["missing"] == {"trial 2": ["0", "1", "2"]}
-    assert who_is_missing(spread) == [
+    assert not_compared(spread) == [
         "Not compared, because not in the air at the end of trial 2: 0, 1, 2."
     ]
     ends_m = [np.array([r.position_m[-1, :2] for r in record.robots]) for record in (first, second)]
