@@ -218,9 +218,9 @@ def _position_lost(f: _Flight) -> None:
 
 def _position_in_doubt(f: _Flight) -> None:
     f.fly()
-    f.vehicle.gps_told_m = 7.0
+    f.vehicle.gps_accuracy_override_m = 7.0
     f.run(2.0)
-    f.vehicle.gps_told_m = None
+    f.vehicle.gps_accuracy_override_m = None
     f.run(5.0)
 
 
@@ -517,12 +517,12 @@ def _position_silent(f: _Flight) -> None:
     """Of what the vehicle says, positions alone are lost."""
     f.fly()
     vehicle = f.fleet.vehicles[0]
-    said = vehicle._said
-    vars(vehicle)["_said"] = lambda now_s: [
+    said = vehicle._received
+    vars(vehicle)["_received"] = lambda now_s: [
         each for each in said(now_s) if each[0] != "LOCAL_POSITION_NED"
     ]
     f.run(3.0)
-    del vars(vehicle)["_said"]
+    del vars(vehicle)["_received"]
     f.run(1.0)
 
 
@@ -551,9 +551,9 @@ def _refuses_to_be_set(name: str, value: float) -> None:
 
 def _silence(f: _Flight, duration_s: float) -> None:
     """Whatever the vehicle says is lost."""
-    vars(f.fleet.vehicles[0])["_said"] = lambda _: ()
+    vars(f.fleet.vehicles[0])["_received"] = lambda _: ()
     f.run(duration_s)
-    del vars(f.fleet.vehicles[0])["_said"]
+    del vars(f.fleet.vehicles[0])["_received"]
 
 
 def _refused(*_: object, **__: object) -> MavResult:

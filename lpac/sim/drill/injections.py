@@ -105,7 +105,7 @@ def silence(vehicle: Px4Vehicle, _: int, around: Surroundings, sensor: Simulated
 @_on_vehicle
 def report_accuracy(vehicle: Px4Vehicle, _: int, around: Surroundings, accuracy_m: float) -> None:
     """Make the receiver report that accuracy."""
-    vehicle.gps_told_m = accuracy_m
+    vehicle.gps_accuracy_override_m = accuracy_m
 
 
 @_on_vehicle

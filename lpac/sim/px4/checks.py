@@ -60,16 +60,16 @@ class Px4Event:
 class ArmingProblem:
     """One check that fails; masks have a bit per `Px4Mode`.
 
-    `keeps_from_arming` has the modes in which arming is refused, `keeps_from_running` those that
-    cannot be entered, `told_modes` those that the event reports.
+    `blocks_arming` has the modes in which arming is refused, `blocks_entry` those that
+    cannot be entered, `reported_modes` those that the event reports.
     """
 
     number: int
     component: Component
     level: Level
-    keeps_from_arming: int = 0
-    keeps_from_running: int = 0
-    told_modes: int = 0xFFFFFFFF
+    blocks_arming: int = 0
+    blocks_entry: int = 0
+    reported_modes: int = 0xFFFFFFFF
     arguments: bytes = b""
     text: str = ""
     text_level: Level = Level.CRITICAL
@@ -77,7 +77,7 @@ class ArmingProblem:
 
     def event(self) -> Px4Event:
         """As PX4 reports it."""
-        arguments = struct.pack("<IB", self.told_modes, self.component) + self.arguments
+        arguments = struct.pack("<IB", self.reported_modes, self.component) + self.arguments
         return Px4Event(self.number, self.level, arguments, self.text, self.text_level)
 
 
@@ -109,12 +109,12 @@ NO_OFFBOARD_SIGNAL = _mode_problem(3087815, Component.SYSTEM, _ERROR, _OFFBOARD)
 NO_HOME = _mode_problem(79408, Component.SYSTEM, _INFO, _HOME)
 # With COM_RC_IN_MODE 4 (no manual control at all), and otherwise.
 MANUAL_CONTROL_DISABLED = _mode_problem(453929, Component.REMOTE_CONTROL, _ERROR, _BY_HAND)
-NO_MANUAL_CONTROL = replace(MANUAL_CONTROL_DISABLED, level=Level.WARNING, told_modes=0xFFFFFFFF)
+NO_MANUAL_CONTROL = replace(MANUAL_CONTROL_DISABLED, level=Level.WARNING, reported_modes=0xFFFFFFFF)
 MODE_PREVENTS_ARMING = ArmingProblem(
-    1871713, Component.SYSTEM, _INFO, _NOT_FOR_TAKEOFF, told_modes=_NOT_FOR_TAKEOFF
+    1871713, Component.SYSTEM, _INFO, _NOT_FOR_TAKEOFF, reported_modes=_NOT_FOR_TAKEOFF
 )
 GPS_FIX_TOO_LOW = ArmingProblem(
-    12369553, Component.GPS, Level.WARNING, told_modes=_LOCAL | _GLOBAL,
+    12369553, Component.GPS, Level.WARNING, reported_modes=_LOCAL | _GLOBAL,
     text="Preflight: GPS fix too low", text_level=Level.WARNING,
 )  # fmt: skip
 FENCE_BREACHED = ArmingProblem(143019, Component.SYSTEM, _ERROR, _ALL)
@@ -122,7 +122,7 @@ NO_GROUND_STATION = ArmingProblem(6801787, Component.COMMUNICATION_LINKS, _INFO)
 GROUND_STATION_REQUIRED = replace(
     NO_GROUND_STATION,
     level=_ERROR,
-    keeps_from_arming=_ALL,
+    blocks_arming=_ALL,
     text="Preflight Fail: No connection to the GCS",
     text_level=Level.WARNING,
 )
@@ -157,11 +157,11 @@ class HealthReport:
 
     def can_arm(self, mode: Px4Mode) -> bool:
         """Whether the vehicle may be armed in this mode."""
-        return not _union(p.keeps_from_arming for p in self.problems) >> mode & 1
+        return not _union(p.blocks_arming for p in self.problems) >> mode & 1
 
     def can_run(self, mode: Px4Mode) -> bool:
         """Whether the vehicle may fly in this mode."""
-        return not _union(p.keeps_from_running for p in self.problems) >> mode & 1
+        return not _union(p.blocks_entry for p in self.problems) >> mode & 1
 
     def events(self) -> list[Px4Event]:
         """The report as PX4 sends it: a summary, each problem, and a summary of the sensors."""
@@ -170,8 +170,8 @@ class HealthReport:
             0,
             self._bits(is_health=False, warnings=False),
             self._bits(is_health=False, warnings=True),
-            _ALL & ~_union(p.keeps_from_arming for p in self.problems),
-            _ALL & ~_union(p.keeps_from_running for p in self.problems),
+            _ALL & ~_union(p.blocks_arming for p in self.problems),
+            _ALL & ~_union(p.blocks_entry for p in self.problems),
         )
         health = struct.pack(
             "<BIII",
@@ -218,22 +218,22 @@ class HealthReporter:
         self._reported = HealthReport()
         self._reported_at_s = self._FIRST_S - self._INTERVAL_S
 
-    def update(self, report: HealthReport, now_s: float, *, asked: bool = False) -> list[Px4Event]:
+    def update(self, report: HealthReport, now_s: float, *, on_request: bool = False) -> list[Px4Event]:
         """Update the checks; returns the events that PX4 sends about them."""
         self.newest, self.checked_at_s = report, now_s
         is_due = report != self._reported and now_s >= self._reported_at_s + self._INTERVAL_S
-        if not (is_due or asked):
+        if not (is_due or on_request):
             return []
         self.published = report
-        return self._tell(now_s)
+        return self._report(now_s)
 
     def before_failsafe(self, now_s: float) -> list[Px4Event]:
         """Report pending changes at once, before a failsafe acts on them.
 
         PX4 does so by events alone: SYS_STATUS shows them with the next report.
         """
-        return self._tell(now_s) if self.newest != self._reported else []
+        return self._report(now_s) if self.newest != self._reported else []
 
-    def _tell(self, now_s: float) -> list[Px4Event]:
+    def _report(self, now_s: float) -> list[Px4Event]:
         self._reported, self._reported_at_s = self.newest, now_s
         return self.newest.events()

@@ -46,33 +46,33 @@ class DirectVehicle:
         self._frames = VehicleFrames()
         # Cached state with its time and command result, since a robot asks several times a tick;
         # each step clears it.
-        self._told: tuple[float, ActionResult | None, VehicleState] | None = None
+        self._cached: tuple[float, ActionResult | None, VehicleState] | None = None
         # The link has no other subscriber, so messages that the robot does not read only cost time.
         self._link.silence(self._telemetry.messages)
 
     def step(self, dt_s: float) -> None:
         """Advance the vehicle, and receive its messages."""
-        self._told = None
+        self._cached = None
         self.vehicle.step(dt_s)
         now_s = self._clock.monotonic_s()
-        for name, fields in self._said(now_s):
+        for name, fields in self._received(now_s):
             if name == "COMMAND_ACK":
                 self._dialogue.receive_ack(fields["command"], fields["result"], now_s)
             elif name in self._telemetry.messages:
                 self._telemetry.receive(name, fields, now_s)
         if now_s >= self._dialogue.next_s or self._telemetry.needs_origin():
-            self._say(now_s)
+            self._send_due(now_s)
 
     def state(self) -> VehicleState:
         """The vehicle's state by its last messages."""
         now_s, result = self._clock.monotonic_s(), self._dialogue.result
-        if self._told is None or self._told[:2] != (now_s, result):
+        if self._cached is None or self._cached[:2] != (now_s, result):
             state = self._telemetry.state(
                 now_s, system_id=self._system_id, result=result,
                 link_lost=self._frames.lost(now_s), link_twice=self._frames.has_duplicates(now_s),
             )  # fmt: skip
-            self._told = now_s, result, state
-        return self._told[2]
+            self._cached = now_s, result, state
+        return self._cached[2]
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
         """Send a setpoint once."""
@@ -93,7 +93,7 @@ class DirectVehicle:
         """Command an action; its result is known after the vehicle's next step."""
         now_s = self._clock.monotonic_s()
         self._dialogue.command(action, now_s)
-        self._say(now_s)
+        self._send_due(now_s)
 
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
         """PX4's parameters; None for one that it does not have."""
@@ -111,7 +111,7 @@ class DirectVehicle:
         """Whether it still has the uploaded fence."""
         return bool(self._uploaded) and self.vehicle.fence == self._uploaded
 
-    def _say(self, now_s: float) -> None:
+    def _send_due(self, now_s: float) -> None:
         for name, fields in self._dialogue.due_messages(now_s, self.state()):
             if name == "REQUEST_EVENT":
                 self._send(request_event(**fields))
@@ -128,11 +128,11 @@ class DirectVehicle:
     def _send(self, message: Any) -> None:
         header = message.get_header()
         header.srcSystem, header.srcComponent = self._system_id, _COMPANION
-        self._link.hear(_rounded(message))
+        self._link.handle(_rounded(message))
 
-    def _said(self, now_s: float) -> Iterable[tuple[str, Mapping[str, Any]]]:
+    def _received(self, now_s: float) -> Iterable[tuple[str, Mapping[str, Any]]]:
         """Name and fields of each accepted message of the vehicle."""
-        for message in self._link.say():
+        for message in self._link.due_messages():
             number, message_id = message.link_number, message.get_msgId()
             time_name, unit_s = _TIMES.get(message_id, ("", 0.0))
             vehicle_s = getattr(message, time_name) * unit_s if time_name else None

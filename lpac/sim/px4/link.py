@@ -16,7 +16,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from lpac.sim.px4.checks import Component, Px4Event
-from lpac.sim.px4.modes import CUSTOM_MODES, PILOTED, MavResult, Px4Mode
+from lpac.sim.px4.modes import CUSTOM_MODES, MODE_BY_CUSTOM, PILOTED, MavResult, Px4Mode
 from lpac.sim.px4.vector import minus
 from lpac.sim.px4.vehicle import GRAVITY_M_S2, Px4Setpoint, Px4Vehicle, SimulatedSensor
 from lpac.sim.px4.wire import OnTheWire
@@ -26,16 +26,14 @@ FORCE = 21196.0  # MAV_CMD_COMPONENT_ARM_DISARM: param 2 that skips the checks
 FIRMWARE_VERSION = 1 << 24 | 17 << 16 | 0 << 8 | 255  # 1.17.0, release
 PARAMETERS_AT_ONCE = 10
 MAX_DATAGRAM_BYTES = 1400
-# Texts are sent only if a ground station was heard within this time, and up to this age.
-GROUND_STATION_HEARD_S = 2.5
+# Texts are sent only if a ground station sent a heartbeat within this time, and up to this age.
+GROUND_STATION_TIMEOUT_S = 2.5
 TEXT_KEPT_S = 5.0
 TEXT_BYTES = 50
 GPS_SILENT_S = 1.0
 EVENTS_KEPT = 40
 
-# DESCEND cannot be commanded.
-_MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
-_HEARD_OF = {
+_STATUS_BITS = {
     Component.GYROSCOPE: mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO,
     Component.ACCELEROMETER: mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL,
     Component.COMPASS: mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG,
@@ -104,9 +102,9 @@ class Px4Link:
     """MAVLink of one vehicle: its messages, their times, and its commands.
 
     Over a wire it receives datagrams (`receive`) and returns those due (`due`). Within one process
-    it exchanges message objects (`hear`, `say`), at a tenth of the cost: the caller must round
-    their numbers as MAVLink does. The vehicle's `wire` has loss, delay and repeats. Each outgoing
-    message has a `link_number`, from 1 on.
+    it exchanges message objects (`handle`, `due_messages`), at a tenth of the cost: the caller must
+    round their numbers as MAVLink does. The vehicle's `wire` has loss, delay and repeats. Each
+    outgoing message has a `link_number`, from 1 on.
     """
 
     def __init__(
@@ -121,7 +119,7 @@ class Px4Link:
         self._mavlink.robust_parsing = True
         self._out: list[Any] = []
         self._parameters_to_send: list[str] = []
-        self._parameters_told = dict(vehicle.parameters)
+        self._parameters_sent = dict(vehicle.parameters)
         self._upload: list[Any] = []
         self._upload_count = 0
         self._ground_station_at_s = -math.inf
@@ -130,9 +128,9 @@ class Px4Link:
         self._on_the_wire = OnTheWire(system_id)
         self._link_number = 0
         self._event_sequence = 0xFFF5
-        self._told: deque[_Message] = deque(maxlen=EVENTS_KEPT)
-        self._gps_told_at_s = -math.inf
-        self._origin_told: tuple[float, float, float] | None = None
+        self._sent_events: deque[_Message] = deque(maxlen=EVENTS_KEPT)
+        self._gps_sent_at_s = -math.inf
+        self._origin_sent: tuple[float, float, float] | None = None
         # Message id -> builder; PX4's default rates on the onboard link, Hz.
         streams: dict[int, tuple[float, Callable[[], Any]]] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: (1.0, self._heartbeat),
@@ -203,9 +201,9 @@ class Px4Link:
     def receive(self, datagram: bytes) -> None:
         """Handle a client's datagram; other data, and messages to others, are ignored."""
         for message in self._mavlink.parse_buffer(datagram) or ():
-            self.hear(message)
+            self.handle(message)
 
-    def hear(self, message: Any) -> None:
+    def handle(self, message: Any) -> None:
         """Handle a client's message; those to others are ignored."""
         kind = message.get_type()
         self.vehicle.commands += kind in _COMMAND_KINDS
@@ -219,7 +217,7 @@ class Px4Link:
     def due(self) -> list[bytes]:
         """The datagrams to send now."""
         datagrams = [b""]
-        for message in self.say():
+        for message in self.due_messages():
             self._mavlink.seq = message.link_number % 256
             packet = bytes(message.pack(self._mavlink))
             if len(datagrams[-1]) + len(packet) > MAX_DATAGRAM_BYTES:
@@ -227,21 +225,21 @@ class Px4Link:
             datagrams[-1] += packet
         return [datagram for datagram in datagrams if datagram]
 
-    def say(self) -> list[Any]:
+    def due_messages(self) -> list[Any]:
         """The messages that arrive now: answers first, then the streams that are due."""
         vehicle = self.vehicle
         for event in vehicle.take_events():
             self._event_sequence = (self._event_sequence + 1) % 0x10000
-            self._told.append(self._event(event))
-            self._send(self._told[-1])
+            self._sent_events.append(self._event(event))
+            self._send(self._sent_events[-1])
             self._texts.append((vehicle.time_s, event))
         if self._texts:
             self._send_texts()
-        if vehicle.parameters != self._parameters_told:
+        if vehicle.parameters != self._parameters_sent:
             for name, value in vehicle.parameters.items():
-                if value != self._parameters_told.get(name):
+                if value != self._parameters_sent.get(name):
                     self._send_parameter(name)
-            self._parameters_told = dict(vehicle.parameters)
+            self._parameters_sent = dict(vehicle.parameters)
         if self._parameters_to_send:
             for name in self._parameters_to_send[:PARAMETERS_AT_ONCE]:
                 self._send_parameter(name)
@@ -271,9 +269,9 @@ class Px4Link:
         return message is not None
 
     def _send_texts(self) -> None:
-        """Send fresh texts if a ground station is heard, long ones in chunks."""
+        """Send fresh texts while a ground station is connected, long ones in chunks."""
         now_s = self.vehicle.time_s
-        if now_s - self._ground_station_at_s <= GROUND_STATION_HEARD_S:
+        if now_s - self._ground_station_at_s <= GROUND_STATION_TIMEOUT_S:
             for at_s, event in self._texts:
                 if not event.text or now_s - at_s >= TEXT_KEPT_S:
                     continue
@@ -331,12 +329,12 @@ class Px4Link:
         report = vehicle.health
         present, healthy = 0, _NEVER_ILL
         has, ill = (frozenset(),) * 2 if report is None else (report.present, report.unhealthy)
-        for component, bits in _HEARD_OF.items():
+        for component, bits in _STATUS_BITS.items():
             if component in has:
                 present |= bits
             if component not in ill:
                 healthy |= bits
-        enabled = present | sum(bits for bits in _HEARD_OF.values() if not healthy & bits)
+        enabled = present | sum(bits for bits in _STATUS_BITS.values() if not healthy & bits)
         if report is not None and report.can_arm(vehicle.mode):
             healthy |= mavlink.MAV_SYS_STATUS_PREARM_CHECK
         return mavlink.MAVLink_sys_status_message(
@@ -346,7 +344,7 @@ class Px4Link:
             300,
             round(vehicle.voltage_v * 1e3),
             round(vehicle.current_a * 100.0),
-            math.ceil(vehicle.battery_told * 100.0),
+            math.ceil(vehicle.battery_reported * 100.0),
             *(0,) * 6,
         )
 
@@ -365,14 +363,14 @@ class Px4Link:
     def _gps_global_origin(self) -> Any:
         if not self.vehicle.estimator.has_origin:
             return None
-        self._origin_told = self.vehicle.global_origin
+        self._origin_sent = self.vehicle.global_origin
         return mavlink.MAVLink_gps_global_origin_message(
-            *_as_integers(self._origin_told), self._boot_ms() * 1000
+            *_as_integers(self._origin_sent), self._boot_ms() * 1000
         )
 
     def _moved_origin(self) -> Any:
         """The origin if it has changed: the stream sends it only then."""
-        is_known = self._origin_told == self.vehicle.global_origin
+        is_known = self._origin_sent == self.vehicle.global_origin
         return None if is_known else self._gps_global_origin()
 
     def _current_event_sequence(self) -> Any:
@@ -428,7 +426,7 @@ class Px4Link:
             round(vehicle.current_a * 100.0),
             -1,
             -1,
-            int(vehicle.battery_told * 100.0),
+            int(vehicle.battery_reported * 100.0),
             0,
             vehicle.battery_warning,
         )
@@ -444,7 +442,7 @@ class Px4Link:
         )
 
     def _rc_channels(self) -> Any:
-        if not self.vehicle.rc_heard:
+        if not self.vehicle.rc_received:
             return None
         return mavlink.MAVLink_rc_channels_message(
             self._boot_ms(), 8, *(1500,) * 8, *(0xFFFF,) * 10, 254
@@ -453,15 +451,15 @@ class Px4Link:
     def _gps_raw_int(self) -> Any:
         vehicle = self.vehicle
         if vehicle.silent_s(SimulatedSensor.GPS) >= 0.0:
-            if vehicle.time_s - self._gps_told_at_s <= GPS_SILENT_S:
+            if vehicle.time_s - self._gps_sent_at_s <= GPS_SILENT_S:
                 return None
             # Without a driver all fields are unknown, even the accuracy.
-            self._gps_told_at_s = vehicle.time_s
+            self._gps_sent_at_s = vehicle.time_s
             unknown = 0xFFFF
             return mavlink.MAVLink_gps_raw_int_message(
                 0, 0, 0, 0, 0, unknown, unknown, unknown, unknown, 0xFF
             )
-        self._gps_told_at_s = vehicle.time_s
+        self._gps_sent_at_s = vehicle.time_s
         v_north, v_east, _ = vehicle.fix_velocity_m_s
         speed_cm_s = round(100.0 * math.hypot(v_north, v_east))
         course_cdeg = round(100.0 * math.degrees(math.atan2(v_east, v_north))) % 36000
@@ -615,9 +613,9 @@ class Px4Link:
         else:
             frame = bytes(message.data)
             first, last = struct.unpack("<HH", frame[10 : 10 + frame[1]].ljust(4, b"\0")[:4])
-        for told in self._told:
-            if (told.sequence - first) % 0x10000 <= (last - first) % 0x10000:
-                self._send(told)
+        for event in self._sent_events:
+            if (event.sequence - first) % 0x10000 <= (last - first) % 0x10000:
+                self._send(event)
 
     def _arm_or_disarm(self, message: Any) -> MavResult:
         """Force applies to disarming only: no client can arm past the checks."""
@@ -632,7 +630,7 @@ class Px4Link:
         self._enter(message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24)
 
     def _enter(self, main_mode: int, sub_mode: int) -> MavResult:
-        mode = _MODES.get((main_mode, sub_mode))
+        mode = MODE_BY_CUSTOM.get((main_mode, sub_mode))
         return MavResult.TEMPORARILY_REJECTED if mode is None else self.vehicle.set_mode(mode)
 
     def _take_off(self, message: Any) -> MavResult:
@@ -751,7 +749,7 @@ class Px4Link:
             self._answer_mission(message, mavlink.MAV_MISSION_UNSUPPORTED)
             return
         self._upload, self._upload_count = [], message.count
-        self._ask_for_next_item(message)
+        self._request_next_item(message)
 
     def _on_mission_item(self, message: Any) -> None:
         if message.mission_type != _FENCE or message.seq != len(self._upload):
@@ -760,9 +758,9 @@ class Px4Link:
             self._answer_mission(message, mavlink.MAV_MISSION_UNSUPPORTED)
             return
         self._upload.append(message)
-        self._ask_for_next_item(message)
+        self._request_next_item(message)
 
-    def _ask_for_next_item(self, message: Any) -> None:
+    def _request_next_item(self, message: Any) -> None:
         if len(self._upload) < self._upload_count:
             self._send(
                 mavlink.MAVLink_mission_request_int_message(

@@ -31,6 +31,8 @@ CUSTOM_MODES = {
     Px4Mode.OFFBOARD: (6, 0),
     Px4Mode.STABILIZED: (7, 0),
 }
+# The commandable mode of each (main mode, sub mode).
+MODE_BY_CUSTOM = {c: mode for mode, c in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
 PILOTED = frozenset({Px4Mode.MANUAL, Px4Mode.ALTCTL, Px4Mode.POSCTL, Px4Mode.STABILIZED})
 NEED_POSITION = frozenset(
     {Px4Mode.POSCTL, Px4Mode.HOLD, Px4Mode.RETURN, Px4Mode.OFFBOARD, Px4Mode.TAKEOFF, Px4Mode.LAND}

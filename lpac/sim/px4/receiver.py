@@ -37,7 +37,7 @@ class Receiver:
             self._scattered_m = level(times(draws.take(3), self.scatter_m))
 
     @property
-    def lies(self) -> bool:
+    def faulty(self) -> bool:
         """Whether the reported position or velocity is wrong."""
         wrong = (self._crept_m, self._scattered_m, self.velocity_bias_m_s)
         return self._stuck_at_m is not None or wrong != (ZERO, ZERO, ZERO)

@@ -183,7 +183,7 @@ class Px4Vehicle:
     `gps_bias_m`, `gps_lost` (the receiver runs, without satellites), `gps_jump_m` (sudden error of
     the fix, which the estimator may reject or follow, as the other faults of its `receiver`),
     `gps_offset_m` and `gps_drift_m_s` (error that fix and estimate share, and its unbounded rate),
-    `compass_jump_rad`, `gps_told_m` (reported accuracy, instead of the receiver's own),
+    `compass_jump_rad`, `gps_accuracy_override_m` (reported accuracy, instead of the receiver's own),
     `estimate_frozen` (old position and velocity are sent on), `dead_sensors` (their drivers are
     silent), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (share of thrust lost in
     flight: above 0.51 the vehicle sinks), `wire` (faults of its messages). `thrust` is the
@@ -232,7 +232,7 @@ class Px4Vehicle:
 
         self.gps_lost = self.estimate_frozen = False
         self.gps_jump_m = self.gps_offset_m = self.gps_drift_m_s = ZERO
-        self.gps_told_m: float | None = None
+        self.gps_accuracy_override_m: float | None = None
         self.receiver = Receiver()
         self._frozen: tuple[Vector, Vector] | None = None
         self.dead_sensors: set[SimulatedSensor] = set()
@@ -353,8 +353,8 @@ class Px4Vehicle:
         accuracy_m = GPS_ACCURACY_M
         if self._errors is not None:
             accuracy_m = self._errors.gps_accuracy_m(self.time_s)
-        if self.gps_told_m is not None:
-            accuracy_m = self.gps_told_m, GPS_VERTICAL * self.gps_told_m
+        if self.gps_accuracy_override_m is not None:
+            accuracy_m = self.gps_accuracy_override_m, GPS_VERTICAL * self.gps_accuracy_override_m
         return *accuracy_m, GPS_ACCURACY_M_S
 
     @property
@@ -406,7 +406,7 @@ class Px4Vehicle:
         return EMPTY_V + FULL_ABOVE_EMPTY_V * self.battery_remaining - sag_v
 
     @property
-    def battery_told(self) -> float:
+    def battery_reported(self) -> float:
         """PX4's estimate of the charge, 0 to 1; too low if the voltage sags more than assumed."""
         if self._errors is None:
             return self.battery_remaining
@@ -414,7 +414,7 @@ class Px4Vehicle:
         return max(0.0, self.battery_remaining - unknown_v / FULL_ABOVE_EMPTY_V)
 
     @property
-    def rc_heard(self) -> bool:
+    def rc_received(self) -> bool:
         """Whether a remote control is received, and enabled."""
         is_stale = self._errors is not None and self._errors.is_remote_control_stale(self.time_s)
         return self.rc_connected and not is_stale and not self._no_manual_control
@@ -426,10 +426,10 @@ class Px4Vehicle:
     @property
     def battery_warning(self) -> int:
         """MAV_BATTERY_CHARGE_STATE: 1 is ok, 2 low, 3 critical, 4 emergency."""
-        told, parameters = self.battery_told, self.parameters
-        if told >= parameters["BAT_LOW_THR"]:
+        charge, parameters = self.battery_reported, self.parameters
+        if charge >= parameters["BAT_LOW_THR"]:
             return 1
-        return 2 + (told < parameters["BAT_CRIT_THR"]) + (told < parameters["BAT_EMERGEN_THR"])
+        return 2 + (charge < parameters["BAT_CRIT_THR"]) + (charge < parameters["BAT_EMERGEN_THR"])
 
     @property
     def armable(self) -> bool:
@@ -441,7 +441,7 @@ class Px4Vehicle:
         events, self._events = self._events, []
         return events
 
-    def _say(self, number: int, level: Level, text: str = "", arguments: bytes = b"") -> None:
+    def _emit(self, number: int, level: Level, text: str = "", arguments: bytes = b"") -> None:
         self._events.append(Px4Event(number, level, arguments, text, level))
 
     def arm(self, *, force: bool = False) -> MavResult:
@@ -451,7 +451,7 @@ class Px4Vehicle:
         self._run_checks()
         if not (force or self._reporter.newest.can_arm(self.mode)):
             text = "Arming denied: Resolve system health failures first\t"
-            self._say(_ARMING_DENIED, Level.CRITICAL, text)
+            self._emit(_ARMING_DENIED, Level.CRITICAL, text)
             return MavResult.TEMPORARILY_REJECTED
         self.armed = True
         self._armed_at_s = self.time_s
@@ -461,7 +461,7 @@ class Px4Vehicle:
         self.failsafe.reset()
         self.home_m = self.estimate_m()
         text = "Armed by external command\t"
-        self._say(_ARMED_BY, Level.INFO, text, bytes([_BY_COMMAND]))
+        self._emit(_ARMED_BY, Level.INFO, text, bytes([_BY_COMMAND]))
         return MavResult.ACCEPTED
 
     def disarm(self, *, force: bool = False, reason: int = _BY_COMMAND) -> MavResult:
@@ -469,14 +469,14 @@ class Px4Vehicle:
         if not self.armed:
             return MavResult.ACCEPTED
         if not self.landed and not force:
-            self._say(_DISARMING_DENIED, Level.CRITICAL, "Disarming denied: not landed\t")
+            self._emit(_DISARMING_DENIED, Level.CRITICAL, "Disarming denied: not landed\t")
             return MavResult.TEMPORARILY_REJECTED
         self.armed = False
         self._disarmed_at_s = self.time_s
         self.failsafe.reset()
         self._set_intended_mode(self._mode_after_disarm)
         self.mode = self.intended_mode
-        self._say(_DISARMED_BY, Level.INFO, "Disarmed\t", bytes([reason]))
+        self._emit(_DISARMED_BY, Level.INFO, "Disarmed\t", bytes([reason]))
         return MavResult.ACCEPTED
 
     def set_mode(self, mode: Px4Mode) -> MavResult:
@@ -492,15 +492,15 @@ class Px4Vehicle:
         if mode is Px4Mode.TAKEOFF:
             self._takeoff_down_m = self._home_down_m() - self.parameters["MIS_TAKEOFF_ALT"]
         if mode is Px4Mode.LAND:
-            self._say(_LANDING_ORDERED, Level.INFO, "Landing at current position\t")
+            self._emit(_LANDING_ORDERED, Level.INFO, "Landing at current position\t")
         if self.failsafe.take_over():
-            self._say(_TAKEN_OVER, Level.INFO)
+            self._emit(_TAKEN_OVER, Level.INFO)
         self._set_intended_mode(mode)
         return MavResult.ACCEPTED
 
     def run_prearm_checks(self) -> MavResult:
         """Run the arming checks and report all problems."""
-        self._run_checks(asked=True)
+        self._run_checks(on_request=True)
         return MavResult.ACCEPTED
 
     def take_off(self, altitude_m: float) -> MavResult:
@@ -539,7 +539,7 @@ class Px4Vehicle:
             self._hold_m = None
         bit = 2 if self.mode is Px4Mode.OFFBOARD else 1
         override = int(self.parameters["COM_RC_OVERRIDE"]) & bit
-        if self.mode not in PILOTED and override and self.rc_heard and any(self._sticks_m_s):
+        if self.mode not in PILOTED and override and self.rc_received and any(self._sticks_m_s):
             self.set_mode(Px4Mode.POSCTL)
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
@@ -594,9 +594,9 @@ class Px4Vehicle:
         has_gps = has_gps and bool(self.parameters["EKF2_GPS_CTRL"])
         self.receiver.step(dt_s, self._honest_fix_m, self._draws)
         off_m, off_m_s = self.gps_jump_m, ZERO
-        if self.receiver.lies:
-            told_m = plus(self._position_m, self._shared_error_m())
-            off_m = plus(off_m, self.receiver.off_m(told_m))
+        if self.receiver.faulty:
+            honest_m = plus(self._position_m, self._shared_error_m())
+            off_m = plus(off_m, self.receiver.off_m(honest_m))
             off_m_s = self.receiver.off_m_s(self._velocity_m_s)
         self.estimator.step(self.time_s, dt_s, has_gps, off_m, off_m_s, draws[:6])
         decay = dt_s / VERTICAL_DRIFT_TIME_S
@@ -612,21 +612,21 @@ class Px4Vehicle:
             sensor: self._dead_since_s.get(sensor, self.time_s) for sensor in self.dead_sensors
         }
 
-    def _run_checks(self, *, asked: bool = False) -> None:
+    def _run_checks(self, *, on_request: bool = False) -> None:
         used_gps = Component.GPS in self._reporter.newest.present
-        self._events += self._reporter.update(self._checks(), self.time_s, asked=asked)
+        self._events += self._reporter.update(self._checks(), self.time_s, on_request=on_request)
         if not self.armed and not self.estimator.has_gps and not self.estimator.position_valid:
             self.home_m = None
         uses_gps = self.estimator.uses_gps
         if self.armed and uses_gps is not used_gps:
             number = _FUSION_STARTED if uses_gps else _FUSION_STOPPED
             text = f"GNSS data fusion {'started' if uses_gps else 'stopped'}\t"
-            self._say(number, Level.INFO, text)
+            self._emit(number, Level.INFO, text)
 
     def _checks(self) -> HealthReport:
         """All current problems, in PX4's order."""
         parameters = self.parameters
-        rc_heard, ground_station_lost = self.rc_heard, self._ground_station_lost()
+        rc_received, ground_station_lost = self.rc_received, self._ground_station_lost()
         position_valid = self.estimator.position_valid
         is_there = set(_ALWAYS_THERE)
         if self.estimator.uses_gps:
@@ -637,7 +637,7 @@ class Px4Vehicle:
             or self.time_s - self._disarmed_at_s < LOG_ENDS_S
         ):
             is_there.add(Component.LOGGING)
-        if rc_heard:
+        if rc_received:
             is_there.add(Component.REMOTE_CONTROL)
         if not ground_station_lost:
             is_there.add(Component.COMMUNICATION_LINKS)
@@ -659,7 +659,7 @@ class Px4Vehicle:
             (not self._offboard_signal(), checks.NO_OFFBOARD_SIGNAL),
             (self.home_m is None and self.estimator.is_ready, checks.NO_HOME),
             (
-                not rc_heard,
+                not rc_received,
                 checks.MANUAL_CONTROL_DISABLED
                 if self._no_manual_control
                 else checks.NO_MANUAL_CONTROL,
@@ -716,39 +716,39 @@ class Px4Vehicle:
         )
         action = self.failsafe.action
         if action > before:
-            self._tell_failsafe(cause, causes[cause], action)
+            self._report_failsafe(cause, causes[cause], action)
         if action is FailsafeAction.STOP_MOTORS:
             self.disarm(force=True, reason=_BY_FAILSAFE)
             return
         self._enter(ACTION_MODES.get(action, self.intended_mode))
 
-    def _tell_failsafe(
+    def _report_failsafe(
         self, cause: FailsafeCause, wanted: FailsafeAction, action: FailsafeAction
     ) -> None:
         self._run_checks()
         self._events += self._reporter.before_failsafe(self.time_s)
         main, sub = CUSTOM_MODES[self.intended_mode]
         mode = struct.pack("<I", main << 16 | sub << 24)
-        told = self.battery_warning + 1 if cause is FailsafeCause.BATTERY else _CAUSES.get(cause, 0)
-        generic, told_cause = not told, bytes([told] if told else [])
+        number = self.battery_warning + 1 if cause is FailsafeCause.BATTERY else _CAUSES.get(cause, 0)
+        generic, cause_bytes = not number, bytes([number] if number else [])
         if action is FailsafeAction.WARN and cause is FailsafeCause.BATTERY:
             level = Level.WARNING if self.battery_warning == 2 else Level.CRITICAL
-            self._say(_BATTERY_WARNINGS[self.battery_warning], level)
+            self._emit(_BATTERY_WARNINGS[self.battery_warning], level)
         elif action is FailsafeAction.WARN:
-            self._say(_FAILSAFE_WARNS[generic], Level.WARNING, arguments=mode + told_cause)
+            self._emit(_FAILSAFE_WARNS[generic], Level.WARNING, arguments=mode + cause_bytes)
         elif action is FailsafeAction.HOLD and wanted is not FailsafeAction.HOLD:
             wait_s = round(self.parameters["COM_FAIL_ACT_T"])
             text = f"Failsafe activated: entering Hold for {wait_s} seconds\t"
-            arguments = mode + struct.pack("<BH", _ACTIONS[wanted], wait_s) + told_cause
-            self._say(_FAILSAFE_HOLDS[generic], Level.CRITICAL, text, arguments)
+            arguments = mode + struct.pack("<BH", _ACTIONS[wanted], wait_s) + cause_bytes
+            self._emit(_FAILSAFE_HOLDS[generic], Level.CRITICAL, text, arguments)
         else:
-            number = (
+            event = (
                 _FAILSAFE_ACTS[generic]
                 if action is not FailsafeAction.DESCEND
                 else _POSITION_FAILSAFE
             )
-            arguments = mode + bytes([_ACTIONS[action]]) + told_cause
-            self._say(number, Level.CRITICAL, "Failsafe activated\t", arguments)
+            arguments = mode + bytes([_ACTIONS[action]]) + cause_bytes
+            self._emit(event, Level.CRITICAL, "Failsafe activated\t", arguments)
 
     def _on_offboard_loss(self) -> FailsafeAction:
         if self.intended_mode is not Px4Mode.OFFBOARD or self._offboard_signal():
@@ -758,12 +758,12 @@ class Px4Vehicle:
         setting = int(self.parameters["COM_OBL_RC_ACT"])
         if setting in OFFBOARD_LOSS_ACTIONS:
             return OFFBOARD_LOSS_ACTIONS[setting]
-        if self.rc_heard:
+        if self.rc_received:
             return FailsafeAction.POSCTL
         return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_RCL_ACT"]), _NONE)
 
     def _on_manual_control_loss(self) -> FailsafeAction:
-        if not self._rc_at_arming or self.rc_heard or self._no_manual_control:
+        if not self._rc_at_arming or self.rc_received or self._no_manual_control:
             return _NONE
         excepted = {Px4Mode.HOLD: 2, Px4Mode.OFFBOARD: 4}.get(self.intended_mode, 0)
         if int(self.parameters["COM_RCL_EXCEPT"]) & excepted:
@@ -1012,7 +1012,7 @@ class Px4Vehicle:
             if self.time_s - self._off_ground_since_s < IN_AIR_AFTER_S:
                 return
             if self.landed and self.armed:
-                self._say(_TAKEOFF_DETECTED, Level.INFO, "Takeoff detected\t")
+                self._emit(_TAKEOFF_DETECTED, Level.INFO, "Takeoff detected\t")
             self._took_off = self._took_off or self.armed
             self.landed = False
             return
@@ -1023,7 +1023,7 @@ class Px4Vehicle:
         on_ground_s = self.time_s - self._on_ground_since_s
         if not self.landed and on_ground_s >= LANDED_AFTER_S:
             self.landed = True
-            self._say(_LANDING_DETECTED, Level.INFO, "Landing detected\t")
+            self._emit(_LANDING_DETECTED, Level.INFO, "Landing detected\t")
         if self.armed and self.landed:
             self._disarm_when_idle(on_ground_s - LANDED_AFTER_S)
 

@@ -33,10 +33,10 @@ class OnTheWire:
         """Draw whether the next message is lost."""
         return wire.loss > 0.0 and self._random.random() < wire.loss
 
-    def pass_on(self, said: Sequence[Any], wire: MavlinkWire, now_s: float) -> list[Any]:
+    def pass_on(self, messages: Sequence[Any], wire: MavlinkWire, now_s: float) -> list[Any]:
         """Return the messages that arrive now, late ones included."""
         arrived = []
-        for message in said:
+        for message in messages:
             if self.is_lost(wire):
                 continue
             is_late = self._random.random() < wire.late

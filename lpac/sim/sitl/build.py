@@ -45,7 +45,7 @@ GROUND_PORT = 18570
 TRUTH_PORT = 19410
 _AIRBORNE_ABOVE_M = 0.15
 _STOP_WITHIN_S = 3.0
-_HEARD_WITHIN_S = 30.0
+_STATE_WITHIN_S = 30.0
 _MODEL, _AIRFRAME = "sihsim_quadx", "10040"
 # Log everything from start to end. Two calibrations that change their rate on arming are off: on a
 # multithreaded computer PX4's list of timers can then lose its tail, and with it all simulated
@@ -109,9 +109,9 @@ class _Instance:
         assert self.process is not None and self.process.returncode is not None
         code = self.process.returncode
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        return f"{how}: {self.last_words()}"
+        return f"{how}: {self.last_output()}"
 
-    def last_words(self) -> str:
+    def last_output(self) -> str:
         """The last error in px4.log, or its last line without one."""
         log = self.folder / "px4.log"
         text = re.sub(r"\x1b\[[0-9;]*m", "", log.read_text(errors="replace"))
@@ -161,7 +161,7 @@ class Px4Build:
         self._starts_m = tuple(starts_m)
         self._world = world
         self._instances = tuple(_Instance(i, folder / str(i)) for i in range(len(starts_m)))
-        self._heard_lock = threading.Lock()
+        self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="px4-truth", daemon=True)
         self._selector = selectors.DefaultSelector()
@@ -198,12 +198,12 @@ class Px4Build:
             process = instance.process
             if process is not None and process.poll() is not None:
                 raise VehicleError(f"the PX4 of r{instance.number} has ended, {instance.ending()}")
-            with self._heard_lock:
-                heard = bool(instance.places)
-            if not heard and time.monotonic() - instance.started_s > _HEARD_WITHIN_S:
+            with self._lock:
+                received = bool(instance.places)
+            if not received and time.monotonic() - instance.started_s > _STATE_WITHIN_S:
                 raise VehicleError(
                     f"the PX4 of r{instance.number} has not sent its vehicle's state within "
-                    f"{_HEARD_WITHIN_S:g} s: {instance.last_words()}"
+                    f"{_STATE_WITHIN_S:g} s: {instance.last_output()}"
                 )
 
     def tracks(self) -> tuple[TrueTrack, ...]:
@@ -212,14 +212,14 @@ class Px4Build:
 
     def forget(self) -> None:
         """Drop the history of each vehicle."""
-        with self._heard_lock:
+        with self._lock:
             for instance in self._instances:
                 del instance.places[:-1]
                 del instance.clock[1:-1]
 
     def lost_s(self) -> float:
         """Lateness of the slowest PX4's clock, s."""
-        with self._heard_lock:
+        with self._lock:
             clocks = [(i.clock[0], i.clock[-1]) for i in self._instances if i.clock]
         lost_s = [
             (last_s - first_s) - (px4_last_s - px4_first_s)
@@ -230,7 +230,7 @@ class Px4Build:
     def stood_still_s(self, since_s: float) -> float:
         """Longest standstill of a PX4's clock since then (`time.monotonic()`), s."""
         longest_s = 0.0
-        with self._heard_lock:
+        with self._lock:
             for instance in self._instances:
                 clock_s = np.array([pair for pair in instance.clock if pair[0] >= since_s])
                 passed_s = np.diff(clock_s.reshape(-1, 2), axis=0)
@@ -265,7 +265,7 @@ class Px4Build:
                 velocity_error_m_s=truth.velocity_error_m_s,
                 commands=np.zeros(len(time_s), np.int64),
             )
-        with self._heard_lock:
+        with self._lock:
             places = tuple(instance.places)
         position_m = np.array([place.position_m for place in places]).reshape(-1, 3)
         airborne = position_m[:, 2] < -_AIRBORNE_ABOVE_M
@@ -340,18 +340,18 @@ class Px4Build:
             if message_id == mavlink.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS:
                 # It comes 200 times a second; only its first field, PX4's time, is needed.
                 (time_us,) = struct.unpack("<Q", payload(frame, 8))
-                with self._heard_lock:
+                with self._lock:
                     if not instance.clock or now_s - instance.clock[-1][0] > _CLOCK_PERIOD_S:
                         instance.clock.append((now_s, time_us * 1e-6))
                         print(f"{time.time():.3f},{time_us * 1e-6:.3f}", file=instance.clock_table)
             elif message_id == mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION:
                 for message in instance.parser.parse_buffer(frame) or ():
-                    self._hear(instance, now_s, message)
+                    self._add_place(instance, now_s, message)
 
-    def _hear(self, instance: _Instance, now_s: float, message: Any) -> None:
+    def _add_place(self, instance: _Instance, now_s: float, message: Any) -> None:
         north_m, east_m = self._world.to_world(message.lat * 1e-7, message.lon * 1e-7)
         place = _Place(now_s, (north_m, east_m, self._world.altitude_m - message.alt * 1e-3))
-        with self._heard_lock:
+        with self._lock:
             instance.places.append(place)
 
 
@@ -436,8 +436,8 @@ def _require_alone(instance: int) -> None:
     if not lock.exists():
         return
     with lock.open("r+b") as file:
-        asked = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
-        kind, _, _, _, pid = struct.unpack("hhqqi4x", fcntl.fcntl(file, fcntl.F_GETLK, asked))
+        query = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+        kind, _, _, _, pid = struct.unpack("hhqqi4x", fcntl.fcntl(file, fcntl.F_GETLK, query))
     if kind != fcntl.F_UNLCK:
         end = f"end it: kill {pid}" if pid > 0 else "end it"
         raise VehicleError(f"another PX4 runs as instance {instance}, perhaps an old one: {end}")

@@ -18,21 +18,20 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F64
-from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
+from lpac.sim.px4.modes import CUSTOM_MODES, MODE_BY_CUSTOM, Px4Mode
 from lpac.sim.px4.world import WorldOrigin
 from lpac.sim.sitl.build import GROUND_PORT, Px4Build, frames
 
 AIRBORNE_ABOVE_M = 0.15
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
-_MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
 # PX4 loses a remote control after half a second, and accepts a pilot's mode only with one.
 _STICKS_PERIOD_S, _MODE_AGAIN_S, _PARAMETERS_AGAIN_S = 0.05, 0.3, 0.5
 # Full sticks; PX4's default (v1.17) has a dead zone, and 10 m/s. The curve is fixed.
 _STICKS_M_S = 4.0
 _STICKS = np.linspace(-1.0, 1.0, 201)
 _CURVE = 0.4 * _STICKS + 0.6 * _STICKS**3
-_AS_THE_STICKS_SAY = {
+_STICK_PARAMETERS = {
     "MPC_VEL_MANUAL": _STICKS_M_S, "MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_VEL_MAX_DN": 1.5,
     "MAN_DEADZONE": 0.0,
 }  # fmt: skip
@@ -52,7 +51,7 @@ _RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 20,
     mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: 25,
 }
-_HEARD = {
+_RECEIVED = {
     *_RATES_HZ, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
     mavlink.MAVLINK_MSG_ID_PARAM_VALUE,
 }  # fmt: skip
@@ -77,7 +76,7 @@ class RealVehicle:
         self._heartbeat_due_s = self._sticks_due_s = self._mode_due_s = 0.0
         self._heading_rad = 0.0
         # Parameters not confirmed yet, by name: the value's bits as a float, and its type.
-        self._asked: dict[str, tuple[float, int]] = {}
+        self._unconfirmed: dict[str, tuple[float, int]] = {}
         self._parameters_due_s = 0.0
         self._sticks_m_s: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._pilots_mode: Px4Mode | None = None
@@ -98,15 +97,15 @@ class RealVehicle:
         return self._rc_connected
 
     @rc_connected.setter
-    def rc_connected(self, heard: bool) -> None:
-        if heard and not self._rc_connected:
+    def rc_connected(self, connected: bool) -> None:
+        if connected and not self._rc_connected:
             self._calibrate()
-        self._rc_connected = heard
+        self._rc_connected = connected
 
     @property
     def unconfirmed(self) -> tuple[str, ...]:
         """Parameters sent to PX4 and not confirmed yet."""
-        return tuple(self._asked)
+        return tuple(self._unconfirmed)
 
     @property
     def landed(self) -> bool:
@@ -178,7 +177,7 @@ class RealVehicle:
         if isinstance(value, int):
             raw = float(np.array([value], np.int32).view(np.float32)[0])
             kind = mavlink.MAV_PARAM_TYPE_INT32
-        self._asked[name] = raw, kind
+        self._unconfirmed[name] = raw, kind
         self._parameters_due_s = 0.0
 
     def clear_fence(self) -> None:
@@ -186,7 +185,7 @@ class RealVehicle:
         fence = mavlink.MAV_MISSION_TYPE_FENCE
         self._send(mavlink.MAVLink_mission_clear_all_message(self._system, 1, fence))
 
-    def _tell_of_battery(self, remaining: float) -> None:
+    def _send_battery(self, remaining: float) -> None:
         cell_v = _EMPTY_CELL_V + remaining * (_FULL_CELL_V - _EMPTY_CELL_V)
         self._send(
             mavlink.MAVLink_battery_status_message(
@@ -208,17 +207,17 @@ class RealVehicle:
     def exchange(self) -> None:
         """Send messages that are due, and handle all received ones."""
         now_s = time.monotonic()
-        self._say(now_s)
+        self._send_due(now_s)
         while datagram := self._receive():
             for message_id, frame in frames(datagram):
-                if message_id in _HEARD:
+                if message_id in _RECEIVED:
                     for message in self._mav.parse_buffer(frame) or ():
                         if (message.get_srcSystem(), message.get_srcComponent()) == (
                             self._system, 1,
                         ):  # fmt: skip
-                            self._hear(now_s, message)
+                            self._handle(now_s, message)
 
-    def _say(self, now_s: float) -> None:
+    def _send_due(self, now_s: float) -> None:
         if now_s >= self._heartbeat_due_s:
             self._heartbeat_due_s = now_s + _HEARTBEAT_PERIOD_S
             self._send(
@@ -227,7 +226,7 @@ class RealVehicle:
                 )
             )
             if self._battery is not None:
-                self._tell_of_battery(self._battery)
+                self._send_battery(self._battery)
             # Repeat until it answers: it does not listen from the start.
             if not self.time_s:
                 for message, rate_hz in _RATES_HZ.items():
@@ -239,7 +238,7 @@ class RealVehicle:
             self._send(self._sticks())
         if now_s >= self._parameters_due_s:
             self._parameters_due_s = now_s + _PARAMETERS_AGAIN_S
-            for name, (raw, kind) in self._asked.items():
+            for name, (raw, kind) in self._unconfirmed.items():
                 self._send(
                     mavlink.MAVLink_param_set_message(self._system, 1, name.encode(), raw, kind)
                 )
@@ -254,7 +253,7 @@ class RealVehicle:
         self._udp.close()
 
     def _calibrate(self) -> None:
-        for name, value in (_AS_THE_STICKS_SAY | _CHANNELS).items():
+        for name, value in (_STICK_PARAMETERS | _CHANNELS).items():
             self.set_parameter(name, value)
 
     def _sticks(self) -> Any:
@@ -264,7 +263,7 @@ class RealVehicle:
         shares = (
             (cos * east - sin * north) / _STICKS_M_S,
             (cos * north + sin * east) / _STICKS_M_S,
-            -down / _AS_THE_STICKS_SAY["MPC_Z_VEL_MAX_UP" if down < 0.0 else "MPC_Z_VEL_MAX_DN"],
+            -down / _STICK_PARAMETERS["MPC_Z_VEL_MAX_UP" if down < 0.0 else "MPC_Z_VEL_MAX_DN"],
         )
         roll, pitch, throttle = np.rint(1500.0 + 500.0 * np.interp(shares, _CURVE, _STICKS))
         return mavlink.MAVLink_rc_channels_override_message(
@@ -276,20 +275,20 @@ class RealVehicle:
             return self._udp.recv(2048)
         return b""
 
-    def _hear(self, now_s: float, message: Any) -> None:
+    def _handle(self, now_s: float, message: Any) -> None:
         kind = message.get_type()
         if kind == "HEARTBEAT":
             self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             custom = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24
-            self.mode = _MODES.get(custom, self.mode)
+            self.mode = MODE_BY_CUSTOM.get(custom, self.mode)
         elif kind == "LOCAL_POSITION_NED":
             self._local_m = np.array([message.x, message.y, message.z])
         elif kind == "PARAM_VALUE":
             # Compare bits: most integers are NaN as floats.
-            told = np.float32(message.param_value).tobytes()
-            asked = self._asked.get(message.param_id)
-            if asked is not None and np.float32(asked[0]).tobytes() == told:
-                del self._asked[message.param_id]
+            confirmed = np.float32(message.param_value).tobytes()
+            sent = self._unconfirmed.get(message.param_id)
+            if sent is not None and np.float32(sent[0]).tobytes() == confirmed:
+                del self._unconfirmed[message.param_id]
         elif kind == "GPS_GLOBAL_ORIGIN":
             latitude, longitude = message.latitude * 1e-7, message.longitude * 1e-7
             north_m, east_m = self._world.to_world(latitude, longitude)

@@ -29,7 +29,7 @@ class VehicleOnAWire(DirectVehicle):
     def _send(self, message: Any) -> None:
         self._link.receive(bytes(message.pack(self._packer)))
 
-    def _said(self, now_s: float) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    def _received(self, now_s: float) -> Iterator[tuple[str, Mapping[str, Any]]]:
         for datagram in self._link.due():
             for message in self._parser.parse_buffer(datagram) or ():
                 yield fields_of(message)

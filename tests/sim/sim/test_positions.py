@@ -69,8 +69,8 @@ LASTING = [
         id="no driver",
     ),
     pytest.param(sets(estimate_frozen=True), PositionCause.FROZEN, 1.5, 3.4, id="frozen"),
-    pytest.param(sets(gps_told_m=11.0), PositionCause.INACCURATE, 0.8, 2.5, id="hopeless"),
-    pytest.param(sets(gps_told_m=6.0), PositionCause.INACCURATE, 0.8, None, id="inaccurate"),
+    pytest.param(sets(gps_accuracy_override_m=11.0), PositionCause.INACCURATE, 0.8, 2.5, id="hopeless"),
+    pytest.param(sets(gps_accuracy_override_m=6.0), PositionCause.INACCURATE, 0.8, None, id="inaccurate"),
     pytest.param(jumps(7.0), PositionCause.DISAGREES, 0.8, 2.5, id="jumps"),
     pytest.param(lies(stuck=True), PositionCause.GPS_STUCK, 1.2, 2.8, id="stuck"),
     pytest.param(
@@ -101,7 +101,7 @@ def test_what_goes_wrong_is_noticed_in_time(
 
 def test_an_accuracy_that_stays_bad_is_lost_after_a_minute() -> None:
     watched = flying()
-    watched.vehicle.gps_told_m = 6.0
+    watched.vehicle.gps_accuracy_override_m = 6.0
     assert [quality for _, quality, _ in run(watched, 59.0)] == [_Q.DOUBTFUL]
     assert [quality for _, quality, _ in run(watched, 2.0)] == [_Q.LOST]
 

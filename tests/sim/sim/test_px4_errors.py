@@ -185,14 +185,14 @@ def test_a_voltage_sags_under_load_and_pulls_the_charge_with_it() -> None:
     errors = next(e for e in (Errors(s, 0) for s in range(20)) if e.resistance_ohm > 0.027)
     vehicle = Px4Vehicle(seed=1, ready_after_s=0.0, errors=errors)
     vehicle.step(STEP_S)
-    resting_v, resting = vehicle.voltage_v, vehicle.battery_told
+    resting_v, resting = vehicle.voltage_v, vehicle.battery_reported
     flown = flying(errors)
     assert flown.voltage_v < resting_v - 0.25
-    assert flown.battery_told < flown.battery_remaining - 0.02 < resting
+    assert flown.battery_reported < flown.battery_remaining - 0.02 < resting
     flown.set_mode(Px4Mode.LAND)
     fly(flown, 30.0)
     assert not flown.armed
-    assert flown.battery_told == pytest.approx(flown.battery_remaining, abs=0.005)
+    assert flown.battery_reported == pytest.approx(flown.battery_remaining, abs=0.005)
 
 
 def test_a_weak_motor_costs_charge() -> None:
@@ -212,6 +212,6 @@ def test_a_remote_control_goes_stale_now_and_then() -> None:
     heard = []
     for _ in range(round(260.0 / STEP_S)):
         vehicle.step(STEP_S)
-        heard.append(vehicle.rc_heard)
+        heard.append(vehicle.rc_received)
     gaps_s = heard.count(False) * STEP_S
     assert 0.2 < gaps_s < 10.0
