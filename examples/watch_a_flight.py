@@ -10,11 +10,11 @@ def watch(moment: FlightMoment) -> None:
     if round(moment.time_s % 1.0, 6) not in (0.0, 1.0):
         return
     costs.append(moment.cost)
-    heard = moment.heard.sum(axis=1)  # how many neighbours each robot hears
+    received = moment.received.sum(axis=1)  # neighbours that each robot receives
     speed_m_s = (moment.velocities_m_s**2).sum(axis=1) ** 0.5
     print(
         f"{moment.time_s:4.1f} s  cost {moment.cost / costs[0]:.3f} of the first, "
-        f"speed {speed_m_s.mean():.2f} m/s, {heard.min()} to {heard.max()} neighbours heard"
+        f"speed {speed_m_s.mean():.2f} m/s, {received.min()} to {received.max()} neighbours received"
     )
     if moment.cost < 0.6 * costs[0]:
         moment.stop()

@@ -8,7 +8,7 @@
     bundle = load_bundle(SHIPPED_BUNDLE)
 
     def watch(moment):                              # each 0.2 s of the flight
-        if moment.time_s > 30.0 and not moment.heard.any():
+        if moment.time_s > 30.0 and not moment.received.any():
             moment.stop()
 
     flight = fly(Scenario(robots=10, seed=7, duration_s=60.0), bundle, watch)

@@ -104,7 +104,7 @@ class Radio:
         self.sent_bytes += len(data)
         air, now_s = self.air, self.schedule.monotonic_s()
         for receiver in self._links:
-            if receiver is sender or not receiver.listens(topic) or len(data) > topic.limit_bytes:
+            if receiver is sender or not receiver.subscribes(topic) or len(data) > topic.limit_bytes:
                 continue
             # All four are drawn for each receiver: changing one fault leaves later draws alone.
             lost, twice, travel, second_travel = self.rng.random(4).tolist()
@@ -116,10 +116,10 @@ class Radio:
             arrives = data
             if air.corruption and self.rng.random() < air.corruption:
                 arrives = _corrupted(data, int(self.rng.integers(8 * len(data))))
-            hear = partial(receiver.hear, topic, key, arrives)
-            self.schedule.at(now_s + air.delay_s * (0.5 + travel), hear)
+            deliver = partial(receiver.deliver, topic, key, arrives)
+            self.schedule.at(now_s + air.delay_s * (0.5 + travel), deliver)
             if twice < air.duplication:
-                self.schedule.at(now_s + air.delay_s * (0.5 + second_travel), hear)
+                self.schedule.at(now_s + air.delay_s * (0.5 + second_travel), deliver)
 
     def _apart(self, sender: int, receiver: int) -> bool:
         if self.air.keeps_apart(sender, receiver):
@@ -155,14 +155,14 @@ class RadioLink:
         """Whether another station uses that robot id."""
         return robot_id in self._radio.others(self)
 
-    def listens(self, topic: Topic) -> bool:
+    def subscribes(self, topic: Topic) -> bool:
         """Whether the link subscribes to the topic."""
         return topic in self._subscriptions
 
-    def hear(self, topic: Topic, key: str, data: bytes) -> None:
+    def deliver(self, topic: Topic, key: str, data: bytes) -> None:
         """Pass a message to its callback, unless the link closed while it was on its way."""
         if self._radio.schedule.monotonic_s() < self.suspended_until_s:
-            self._radio.schedule.at(self.suspended_until_s, partial(self.hear, topic, key, data))
+            self._radio.schedule.at(self.suspended_until_s, partial(self.deliver, topic, key, data))
             return
         callback = self._subscriptions.get(topic)
         if callback is not None:

@@ -294,7 +294,7 @@ class BaselineSwarm:
         """The velocities (N, 2) commanded now."""
         return self._vehicles.velocities_m_s()
 
-    def heard(self, _: float) -> Bools:
+    def received(self, _: float) -> Bools:
         """(N, N): all False; baselines use no messages."""
         return np.zeros((len(self.alive),) * 2, np.bool_)
 

@@ -17,7 +17,7 @@ from lpac.sim.usual import judgement, usual_whole
 
 def summary(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
     """The flight as JSON-ready values."""
-    told = {
+    values = {
         "controller": scenario.controller,
         "bundle_id": record.bundle_id,
         "robots": scenario.robots,
@@ -25,7 +25,7 @@ def summary(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
         "duration_s": scenario.duration_s,
         "cost": _cost_summary(record.cost, record.normalized),
     }
-    return told | (_of_script if record.script.vehicle else _of_points)(scenario, record)
+    return values | (_of_script if record.script.vehicle else _of_points)(scenario, record)
 
 
 def _of_points(scenario: Scenario, record: FlightRecord) -> dict[str, Any]:
@@ -222,12 +222,12 @@ def _fence_line(margin_m: float, true_margin_m: float, position_error_m: float) 
         else f"{-m:.2f} m beyond it"
         for m in (margin_m, true_margin_m)
     )
-    said = f"at the nearest {estimated} by the robots' estimates, {true} in truth"
+    text = f"at the nearest {estimated} by the robots' estimates, {true} in truth"
     if margin_m < 0.0 or true_margin_m < -position_error_m:
-        return f"fence CROSSED: {said}"
+        return f"fence CROSSED: {text}"
     if true_margin_m < 0.0:
-        said = f"{said}, within the {position_error_m:g} m by which estimates may err"
-    return f"fence kept: {said}"
+        text = f"{text}, within the {position_error_m:g} m by which estimates may err"
+    return f"fence kept: {text}"
 
 
 def _outcome(record: FlightRecord) -> str:

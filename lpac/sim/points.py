@@ -172,7 +172,7 @@ class FlyingSwarm(Protocol):
 
     def positions_m(self) -> F64: ...
     def velocities_m_s(self) -> F64: ...
-    def heard(self, now_s: float) -> Bools: ...
+    def received(self, now_s: float) -> Bools: ...
     @property
     def alive(self) -> Bools: ...
 
@@ -223,12 +223,12 @@ class WorldMoment:
         return near & np.logical_and.outer(self.alive, self.alive)
 
     @property
-    def heard(self) -> Bools:
+    def received(self) -> Bools:
         """(N, N), [receiver, sender]: whether a robot holds a fresh message of another.
 
         All False for baselines, which use no messages.
         """
-        return self._flying.heard(self.time_s)
+        return self._flying.received(self.time_s)
 
     @property
     def cost(self) -> float:

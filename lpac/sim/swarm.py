@@ -34,11 +34,11 @@ class SwarmRobot(Protocol):
 
     def perceive(self, now_s: float) -> object: ...
     def control(self, now_s: float) -> F64 | None: ...
-    def say(self, now_s: float) -> Any:
+    def next_message(self, now_s: float) -> Any:
         """Run the policy; returns the message to neighbours, or None."""
 
-    def hear(self, message: Any, now_s: float) -> None:
-        """Receive another robot's message."""
+    def on_message(self, message: Any, now_s: float) -> None:
+        """Handle another robot's message."""
 
 
 AnyRobot = TypeVar("AnyRobot", bound=SwarmRobot)
@@ -71,7 +71,7 @@ class Swarm(Generic[AnyRobot]):
         self.robots = [self._booted(robot) for robot in range(robots)]
         self._gone: list[AnyRobot] = []
         self._failed: set[int] = set()
-        # Events (time, order, what to do) beside the ticks; the order makes equal times
+        # Events (time, order, callback) besides the ticks; the order makes equal times
         # deterministic.
         self._events: list[tuple[float, int, Callable[[], object]]] = []
         self._scheduled = 0
@@ -130,12 +130,12 @@ class Swarm(Generic[AnyRobot]):
         """The velocities (N, 2) commanded now."""
         return self._vehicles.velocities_m_s()
 
-    def heard(self, now_s: float) -> Bools:
+    def received(self, now_s: float) -> Bools:
         """(N, N), [receiver, sender]: whether a robot holds a fresh message; none is consumed."""
-        heard = np.zeros((len(self.robots),) * 2, np.bool_)
+        received = np.zeros((len(self.robots),) * 2, np.bool_)
         for receiver, robot in enumerate(self.robots):
-            heard[receiver, [near.beacon.robot_id for near in robot.table.neighbours(now_s)]] = True
-        return heard & self.alive[:, None]
+            received[receiver, [near.beacon.robot_id for near in robot.table.neighbours(now_s)]] = True
+        return received & self.alive[:, None]
 
     @property
     def alive(self) -> Bools:
@@ -168,7 +168,7 @@ class Swarm(Generic[AnyRobot]):
 
     def _infer(self, robot: int) -> None:
         now_s = self._vehicles.now_s
-        message = self.robots[robot].say(now_s)
+        message = self.robots[robot].next_message(now_s)
         if message is None:
             return
         for receiver, travel_s in self._medium.broadcast(robot, self._vehicles.positions_m()):
@@ -176,7 +176,7 @@ class Swarm(Generic[AnyRobot]):
 
     def _deliver(self, receiver: int, message: Any) -> None:
         if receiver not in self._failed:
-            self.robots[receiver].hear(message, self._vehicles.now_s)
+            self.robots[receiver].on_message(message, self._vehicles.now_s)
 
     def _fail(self, robot: int) -> None:
         self._failed.add(robot)
@@ -204,11 +204,11 @@ class ClockedPac(Pac):
         """`start` identifies this start of the program; the rest is passed to `Pac`."""
         super().__init__(**pac)
         self._start = start
-        self._said = 0
+        self._sent = 0
 
-    def say(self, now_s: float) -> _Message | None:
+    def next_message(self, now_s: float) -> _Message | None:
         """See `SwarmRobot`. Raises PartError if the policy or the sensor fails."""
-        self._tell_time(now_s)
+        self._set_clock(now_s)
         tick = self.infer(now_s)
         if self.problem:
             raise PartError(f"robot {self._robot_id}: {self.problem}")
@@ -218,13 +218,13 @@ class ClockedPac(Pac):
             self.largest_payload = max(
                 self.largest_payload, float(np.abs(payload).max(initial=0.0))
             )
-        self._said += 1
-        return _Message(self.beacon(now_s), (self._start, self._said), tick.message)
+        self._sent += 1
+        return _Message(self.beacon(now_s), (self._start, self._sent), tick.message)
 
-    def hear(self, message: _Message, now_s: float) -> None:
+    def on_message(self, message: _Message, now_s: float) -> None:
         """See `SwarmRobot`."""
-        self._tell_time(now_s)
+        self._set_clock(now_s)
         self.receive(*message, now_s)
 
-    def _tell_time(self, now_s: float) -> None:
+    def _set_clock(self, now_s: float) -> None:
         self.clock.update(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)

@@ -65,16 +65,16 @@ def _nearest(what: str, robots: int, bundle_id: str) -> Usual | None:
 
 def judgement(ratio: float, usual: Usual | None) -> str:
     """Text that compares a flight's ratio with the usual ones."""
-    said = f"{ratio:.2f} times the cost of Lloyd's algorithm, which knows the whole world"
+    text = f"{ratio:.2f} times the cost of Lloyd's algorithm, which knows the whole world"
     if usual is None:
-        return f"is that good? {said}"
+        return f"is that good? {text}"
     verdict = "as usual"
     if ratio < usual.least:
         verdict = "better than usual"
     elif ratio > usual.greatest:
         verdict = "worse than usual"
     return (
-        f"is that good? {verdict}: {said}; 8 in 10 such flights of "
+        f"is that good? {verdict}: {text}; 8 in 10 such flights of "
         f"{counted(usual.robots, 'robot')}: {usual.least:.2f} to {usual.greatest:.2f} "
         f"({usual.flights} were flown)"
     )

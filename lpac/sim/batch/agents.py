@@ -114,11 +114,11 @@ class LpacAgents:
         degrees: Sequence[int],
     ) -> PolicySteps:
         hops = HopBuffer(self._policy.geometry, len(robots))
-        for i, (heard, degree) in enumerate(zip(payloads, degrees, strict=True)):
-            hops.diffuse(heard, degree, i)
+        for i, (received, degree) in enumerate(zip(payloads, degrees, strict=True)):
+            hops.diffuse(received, degree, i)
         velocities = self._policy.velocity(np.stack(features), hops)
-        said = [hops.message(degree, i) for i, degree in enumerate(degrees)]
-        return PolicySteps(velocities, np.stack(said))
+        messages = [hops.message(degree, i) for i, degree in enumerate(degrees)]
+        return PolicySteps(velocities, np.stack(messages))
 
     def reset(self, robot: int) -> None:
         """Do nothing: the agents have no memory."""
@@ -163,9 +163,9 @@ class SingleAgents:
         degrees: Sequence[int],
     ) -> PolicySteps:
         steps = []
-        for robot, seen, heard, degree in zip(robots, features, payloads, degrees, strict=True):
+        for robot, seen, received, degree in zip(robots, features, payloads, degrees, strict=True):
             try:
-                step = self._agents[robot].step(seen, heard, degree)
+                step = self._agents[robot].step(seen, received, degree)
             except Exception as error:
                 raise _failed(in_one_line(error)) from error
             if problem := step_problem(step, self.message_size):

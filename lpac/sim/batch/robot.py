@@ -54,7 +54,7 @@ class DeferredFeatures:
 class DeferredStep:
     """A tick of a robot's policy: its inputs, and its outputs once computed.
 
-    Ticks between two perceptions share `features`. `heeded` are the neighbours' ticks whose
+    Ticks between two perceptions share `features`. `used` are the neighbours' ticks whose
     payloads it uses. `rank` is the length of the longest chain of steps to compute before it.
     Before it is computed, `velocity` (2,) is None and `payload` (message_size,), as neighbours
     receive it, is undefined; `largest` is the payload's largest absolute value.
@@ -62,7 +62,7 @@ class DeferredStep:
 
     robot: "BatchedRobot"
     features: DeferredFeatures
-    heeded: "tuple[DeferredStep, ...]"
+    used: "tuple[DeferredStep, ...]"
     degree: int
     rank: int
     payload: F32
@@ -103,13 +103,13 @@ class DeferredSteps:
             self._step(group)
         for step in steps:
             # Drop references, which would keep all earlier steps alive.
-            step.heeded = ()
+            step.used = ()
 
     def _step(self, steps: list[DeferredStep]) -> None:
         velocities, payloads = self.agents.step(
             [step.robot.agent for step in steps],
             [step.features.values for step in steps],
-            [[other.payload for other in step.heeded] for step in steps],
+            [[other.payload for other in step.used] for step in steps],
             [step.degree for step in steps],
         )
         received = np.empty_like(payloads)
@@ -126,7 +126,7 @@ class DeferredSteps:
             step.velocity = velocities[i]
             step.payload[:] = received[i]
             step.largest = float(largest[i])
-            step.robot.note_payloads(step.heeded)
+            step.robot.note_payloads(step.used)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -189,7 +189,7 @@ class BatchedRobot:
         self._action_s = 0.0
         # The last action that was flown, and its velocity in the mission frame.
         self._flown: tuple[DeferredStep, F64] | None = None
-        self._said = 0
+        self._sent = 0
         self.largest_payload = 0.0
         self.table = NeighbourTable(robot_id, parameters.max_message_age_s)
 
@@ -208,15 +208,15 @@ class BatchedRobot:
         odometry, own = self._own()
         self._seen.observe(own)
         neighbours = self.table.neighbours(now_s)
-        heard = [each.beacon for each in neighbours]
-        near = self._in_range(own, heard)
+        beacons = [each.beacon for each in neighbours]
+        near = self._in_range(own, beacons)
         for (_, message, _), is_near in zip(neighbours, near, strict=True):
             if is_near and message.shared is not None:
                 self._seen.merge(message.shared)
         velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)
         velocity = self._parameters.scale.velocity_to_model(velocity_m_s)
         self._look = _Look(
-            now_s, own, self._to_model(heard)[near], velocity, self._seen.shared_map(own)
+            now_s, own, self._to_model(beacons)[near], velocity, self._seen.shared_map(own)
         )
         self._features = None
 
@@ -225,7 +225,7 @@ class BatchedRobot:
         look = self._fresh_look(now_s)
         return None if look is None else self._inputs(look)
 
-    def say(self, now_s: float) -> _Message | None:
+    def next_message(self, now_s: float) -> _Message | None:
         """Add a pending policy step, and return its message; None without a fresh perception."""
         look = self._fresh_look(now_s)
         if look is None:
@@ -235,29 +235,29 @@ class BatchedRobot:
             self._deferred.add_features(self._features)
         odometry, own = self._own()
         # Read the neighbours before a swap that clears the table.
-        heard = self.table.neighbours(now_s) if self._swap_clears else ()
+        neighbours = self.table.neighbours(now_s) if self._swap_clears else ()
         received = self.table.swap(now_s)
         near = self._in_range(own, [each.beacon for each in received])
         degree = int(near.sum())
-        if heard:
-            degree = max(int(self._in_range(own, [each.beacon for each in heard]).sum()), degree)
-        heeded = tuple(
+        if neighbours:
+            degree = max(int(self._in_range(own, [each.beacon for each in neighbours]).sum()), degree)
+        used = tuple(
             message.step
             for (_, message, _), is_near in zip(received, near.tolist(), strict=True)
             if is_near and isinstance(message, _Deferred)
         )
-        before = (*heeded, self._action) if self._action else heeded
+        before = (*used, self._action) if self._action else used
         step = DeferredStep(
             self,
             self._features,
-            heeded,
+            used,
             degree,
             max((other.rank + 1 for other in before if other.velocity is None), default=0),
             np.empty(self._deferred.agents.message_size, np.float32),
         )
         self._deferred.add(step)
         self._action, self._action_s = step, now_s
-        self._said += 1
+        self._sent += 1
         beacon = Beacon(
             robot_id=self._robot_id,
             sent=FleetTime(0, now_s, 0.0),
@@ -267,7 +267,7 @@ class BatchedRobot:
             bundle_tag=0,
         )
         message = _Deferred(payload=step.payload, shared=look.shared, step=step)
-        return _Message(beacon, (self._start, self._said), message)
+        return _Message(beacon, (self._start, self._sent), message)
 
     def control(self, now_s: float) -> F64 | None:
         """The velocity (2,) in the mission frame, m/s; None when there is no fresh action."""
@@ -282,15 +282,15 @@ class BatchedRobot:
             self._flown = action, limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
         return self._flown[1]
 
-    def hear(self, message: _Message, now_s: float) -> None:
-        """Receive a neighbour's message."""
+    def on_message(self, message: _Message, now_s: float) -> None:
+        """Handle a neighbour's message."""
         sent = message.beacon.sent
         assert sent is not None
         self.table.receive(*message, now_s, now_s - sent.time_s + _AGE_ERROR_S)
 
-    def note_payloads(self, heeded: tuple[DeferredStep, ...]) -> None:
+    def note_payloads(self, used: tuple[DeferredStep, ...]) -> None:
         """Record the largest payload that its policy used."""
-        self.largest_payload = max((self.largest_payload, *(each.largest for each in heeded)))
+        self.largest_payload = max((self.largest_payload, *(each.largest for each in used)))
 
     def _fresh_look(self, now_s: float) -> _Look | None:
         look = self._look

@@ -78,9 +78,9 @@ class SeenMap:
         corner_x, corner_y = corner = window_corner(position, size)
         (x, y), in_window = part_in_world(corner, size, parameters.world_size)
         if self._cells:
-            told = self._cells.importance(corner, size)
-            np.copyto(told, parameters.unseen, where=np.isnan(told))
-            out[in_window] = told[in_window]
+            known = self._cells.importance(corner, size)
+            np.copyto(known, parameters.unseen, where=np.isnan(known))
+            out[in_window] = known[in_window]
         elif parameters.unseen:
             out[in_window] = parameters.unseen
         (x0, y0), (x1, y1) = self._low, self._high

@@ -73,7 +73,7 @@ def test_who_watches_a_flight_changes_nothing(
         assert np.linalg.norm(moment.velocities_m_s, axis=1).max() <= MAX_SPEED_M_S + 1e-9
         away = controller == "lpac" and 1.0 <= moment.time_s < 3.0
         assert moment.alive.tolist() == [True, True, not away, True]
-        assert not (moment.heard | moment.adjacency)[~moment.alive].any()
+        assert not (moment.received | moment.adjacency)[~moment.alive].any()
         return "ignored"
 
     watched = fly_points(scenario, shipped_bundle, watch)
@@ -90,7 +90,7 @@ def test_a_robot_hears_whom_it_is_near(shipped_bundle: Bundle) -> None:
     moments: list[tuple[np.ndarray, np.ndarray]] = []
     scenario = Scenario(robots=4, duration_s=1.0, starts_m=starts_m)
     fly_points(
-        scenario, shipped_bundle, lambda moment: moments.append((moment.heard, moment.adjacency))
+        scenario, shipped_bundle, lambda moment: moments.append((moment.received, moment.adjacency))
     )
     assert not moments[0][0].any()
     np.testing.assert_array_equal(moments[-1][0], moments[-1][1])
