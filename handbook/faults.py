@@ -157,7 +157,7 @@ def _bound(criterion: Criterion) -> Bound:
 
 def _bound_text(bound: Bound) -> str:
     sign = "≥" if type(bound).worst is min else "≤"
-    limit = f"{_SHORT.get(bound.told_as, bound.told_as)} {sign}{bound.limit:.3g}"
+    limit = f"{_SHORT.get(bound.figure_name, bound.figure_name)} {sign}{bound.limit:.3g}"
     begins, ends = max(bound.from_s, 0.0), bound.until_s
     window = ""
     if begins or ends < math.inf:

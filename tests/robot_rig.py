@@ -148,7 +148,7 @@ def write_fleet_of(config_path: Path, config: RobotConfig) -> Path:
 class Rig:
     """A vehicle that runs, a ground that is heard, and the robot's configuration.
 
-    `heard` is what the robot says, whoever commands it.
+    `listener` has the statuses of the robot, whoever commands it.
     """
 
     def __init__(self, config_path: Path, server: Px4Server, links: Sequence[Px4Link]) -> None:
@@ -157,7 +157,7 @@ class Rig:
         self.server = server
         self.link = links[0]
         self.vehicle = links[0].vehicle
-        self.heard = FleetListener(fleet=self.config.fleet, connect=self.config.link.listen)
+        self.listener = FleetListener(fleet=self.config.fleet, connect=self.config.link.listen)
         self.stack = ExitStack()
         self._ground: GroundProgram | None = None
 
@@ -173,7 +173,7 @@ class Rig:
     @property
     def status(self) -> RobotStatus:
         """The robot's newest."""
-        return self.heard.history(ROBOT_ID)[-1].status
+        return self.listener.history(ROBOT_ID)[-1].status
 
     def wait(
         self, condition: Callable[[RobotStatus], object], timeout_s: float = 180.0
@@ -185,7 +185,7 @@ class Rig:
             found[:] = [statuses[ROBOT_ID]] if ROBOT_ID in statuses else []
             return bool(found and condition(found[0]))
 
-        assert self.heard.wait_for(is_so, timeout_s), found
+        assert self.listener.wait_for(is_so, timeout_s), found
         return found[0]
 
     def wait_for_state(self, state: FlightState) -> None:
@@ -223,13 +223,13 @@ class Rig:
         """Why the robot refuses an order, which its ground may not even give; None: it obeys."""
         # Who is silent just now cannot be ordered anything.
         status = self.wait(lambda _: True)
-        with RawGround(self.config.fleet, self.config.link.listen, self.heard) as raw:
+        with RawGround(self.config.fleet, self.config.link.listen, self.listener) as raw:
             return raw.order(kind, status).refusal
 
     def enable(self) -> None:
         """Origin, and its checks; whatever was commanded before is withdrawn."""
         self.command(SetOrigin(ORIGIN))
-        told = self.ground.told.snapshot.ground
+        told = self.ground.subscriber.snapshot.ground
         if told is not None and told.safety_action != "none":
             self.command(Resume())
         self.tell(Enable())
@@ -266,7 +266,7 @@ def rig(
     )
     with Px4Server([Instance(link, 0, client_port) for link in links]) as server:
         made = Rig(path, server, links)
-        with made.heard, made.stack:
+        with made.listener, made.stack:
             yield made
 
 

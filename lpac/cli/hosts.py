@@ -42,7 +42,7 @@ def hosts(
         signal.signal(number, end)
     try:
         with SimulatedHosts(
-            count, out, image=image, bundle=bundle, spares=spares, say=typer.echo
+            count, out, image=image, bundle=bundle, spares=spares, report=typer.echo
         ) as running:
             _give_to_user(out)
             typer.echo(f"fleet {running.fleet}; Ctrl-C ends all; in another terminal:")

@@ -23,10 +23,10 @@ def serve(fleet: "Fleet", fleet_toml: Path, display: "FleetDisplay") -> None:
     from edge.core.counted import counted
 
     with fleet:
-        while not fleet.heard.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
+        while not fleet.listener.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
             fleet.require_running()
             fleet.vehicles.require_running()
-            display.show_or_say("programs start", fleet.heard.statuses())
+            display.show_or_say("programs start", fleet.listener.statuses())
         fleet.begin()
         display.print(
             f"{counted(len(fleet.robots), 'robot')} until Ctrl-C; in a second terminal:\n\n"
@@ -60,7 +60,7 @@ def _watch_over(fleet: "Fleet", display: "FleetDisplay") -> None:
         for robot in [robot for robot in running if not robot.running]:
             running.remove(robot)
             display.say(f"the program of {robot.name} has ended, {robot.ending()}")
-        display.show(f"fleet {fleet.name}", fleet.heard.statuses())
+        display.show(f"fleet {fleet.name}", fleet.listener.statuses())
         fleet.forget()
         time.sleep(0.2)
     raise SimulatedFleetError("the programs of all robots have ended")

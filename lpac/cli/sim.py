@@ -352,7 +352,7 @@ def _serve(scenario: "Scenario", run: RunOptions, count: int | None) -> None:
     try:
         with FleetDisplay(scenario.robots) as display:
             out = run.out or DEFAULT_OUT
-            fleet = Fleet(scenario, out, run.bundle, px4_build=run.px4, say=display.say)
+            fleet = Fleet(scenario, out, run.bundle, px4_build=run.px4, report=display.say)
             fleet.carried = say_if_carried(count, run.bundle, _programs(run))
             serve(fleet, out / fleet.fleet_toml.name, display)
     except KeyboardInterrupt:

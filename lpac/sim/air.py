@@ -102,9 +102,11 @@ class Radio:
         own = sender.station
         key = f"ground/{topic.name}" if topic.sender == "ground" else f"robot/{own}/{topic.name}"
         self.sent_bytes += len(data)
+        if len(data) > topic.limit_bytes:
+            return
         air, now_s = self.air, self.schedule.monotonic_s()
         for receiver in self._links:
-            if receiver is sender or not receiver.subscribes(topic) or len(data) > topic.limit_bytes:
+            if receiver is sender or not receiver.subscribes(topic):
                 continue
             # All four are drawn for each receiver: changing one fault leaves later draws alone.
             lost, twice, travel, second_travel = self.rng.random(4).tolist()

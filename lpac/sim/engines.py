@@ -20,7 +20,7 @@ from lpac.sim.drill.simulated import SUPPORTED, SimulatedDrill
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import fly_programs
 from lpac.sim.fleet.layout import require_whole_robots
-from lpac.sim.fleet.listener import Say
+from lpac.sim.fleet.listener import Report
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.points import fly_points, require_points
 from lpac.sim.scenario import Scenario
@@ -61,7 +61,8 @@ class Engine(Protocol):
         end, `script` in its record says why.
 
         Raises BundleError; ValueError for an unsupported scenario, and for points that were stopped
-        at the start; OSError, and in real time FleetError, LinkError, GroundError or VehicleError.
+        at the start; OSError, and in real time SimulatedFleetError, LinkError, GroundError or
+        VehicleError.
         """
 
 
@@ -132,7 +133,7 @@ class ClockedRobots(_WholeRobots):
     `recorded` is the folder of an earlier flight whose policy outputs are replayed.
     """
 
-    say: Say = lambda _: None
+    report: Report = lambda _: None
     recorded: Path | None = None
 
     def require_able(self, scenario: Scenario) -> None:
@@ -149,7 +150,7 @@ class ClockedRobots(_WholeRobots):
                 drill = drill_of(str(bundle), load_bundle(bundle).id)
                 return drill.fly(scenario, folder if logs else None)
         return fly_simulated(
-            scenario, folder, bundle, self.say, watch, logs=logs, recorded=self.recorded
+            scenario, folder, bundle, self.report, watch, logs=logs, recorded=self.recorded
         )
 
 
@@ -162,7 +163,7 @@ class Programs(_WholeRobots):
     """
 
     px4_build: Path | None = None
-    say: Say = lambda _: None
+    report: Report = lambda _: None
     carries: Callable[[], int | None] = lambda: None
 
     def require_able(self, scenario: Scenario) -> None:
@@ -177,16 +178,23 @@ class Programs(_WholeRobots):
         fault = FAULTS.get(scenario.fault)
         settings = settings_of(fault) if fault else {}
         fleet = Fleet(
-            scenario, folder, bundle, px4_build=self.px4_build, settings=settings, say=self.say
+            scenario,
+            folder,
+            bundle,
+            px4_build=self.px4_build,
+            settings=settings,
+            report=self.report,
         )
         if fault:
             return fly_fault(fleet, fault)
         fleet.carried = self.carries()
-        return fly_programs(fleet, self.say, watch or (lambda _: None))
+        return fly_programs(fleet, self.report, watch or (lambda _: None))
 
 
-def engine_of(name: EngineName, px4_build: Path | None = None, say: Say = lambda _: None) -> Engine:
-    """The engine of that name; `say` gets the progress of a fleet.
+def engine_of(
+    name: EngineName, px4_build: Path | None = None, report: Report = lambda _: None
+) -> Engine:
+    """The engine of that name; `report` gets the progress of a fleet.
 
     Raises ValueError for an unknown name, and for px4 without its build.
     """
@@ -195,7 +203,7 @@ def engine_of(name: EngineName, px4_build: Path | None = None, say: Say = lambda
         raise ValueError("engine = 'px4': needs PX4's build folder: give px4_build")
     if name == "point":
         return Points()
-    return ClockedRobots(say) if name == "simulated" else Programs(px4_build, say)
+    return ClockedRobots(report) if name == "simulated" else Programs(px4_build, report)
 
 
 def flies(engine: EngineName, fault: Fault) -> bool:
@@ -223,7 +231,7 @@ def fly(
     engine: EngineName = "point",
     folder: Path | None = None,
     px4_build: Path | None = None,
-    say: Say = lambda _: None,
+    report: Report = lambda _: None,
 ) -> FlightRecord:
     """Fly one scenario on the engine of that name; `bundle` flies, or sizes a baseline's maps.
 
@@ -232,7 +240,7 @@ def fly(
     """
     if scenario.fault and watch is not None:
         raise ValueError(f"fault = {scenario.fault}: cannot be watched: leave out watch")
-    chosen = engine_of(engine, px4_build, say)
+    chosen = engine_of(engine, px4_build, report)
     chosen.require_able(scenario)
     loaded = load_bundle(bundle) if engine == "point" and isinstance(bundle, Path) else bundle
     # A failing policy ends a batch; with a watcher, points show how the robots react to it.

@@ -68,7 +68,7 @@ class LpacProgram:
         self.send_signal(signal.SIGKILL)
         self.wait()
 
-    def last_words(self) -> str:
+    def last_output(self) -> str:
         """The last non-blank line of its output."""
         lines = self.log.read_text(errors="replace").split("\n") if self.log.exists() else []
         return next((line for line in reversed(lines) if line.strip()), "it printed nothing")
@@ -78,4 +78,4 @@ class LpacProgram:
         code = self.wait(0.0)
         if code is not None and code < 0:
             return f"by {signal.Signals(-code).name}"
-        return f"exit code {code}: {self.last_words()}"
+        return f"exit code {code}: {self.last_output()}"

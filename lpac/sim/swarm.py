@@ -134,7 +134,8 @@ class Swarm(Generic[AnyRobot]):
         """(N, N), [receiver, sender]: whether a robot holds a fresh message; none is consumed."""
         received = np.zeros((len(self.robots),) * 2, np.bool_)
         for receiver, robot in enumerate(self.robots):
-            received[receiver, [near.beacon.robot_id for near in robot.table.neighbours(now_s)]] = True
+            senders = [near.beacon.robot_id for near in robot.table.neighbours(now_s)]
+            received[receiver, senders] = True
         return received & self.alive[:, None]
 
     @property

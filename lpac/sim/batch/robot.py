@@ -240,7 +240,7 @@ class BatchedRobot:
         near = self._in_range(own, [each.beacon for each in received])
         degree = int(near.sum())
         if neighbours:
-            degree = max(int(self._in_range(own, [each.beacon for each in neighbours]).sum()), degree)
+            degree = max(degree, int(self._in_range(own, [n.beacon for n in neighbours]).sum()))
         used = tuple(
             message.step
             for (_, message, _), is_near in zip(received, near.tolist(), strict=True)

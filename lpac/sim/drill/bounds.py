@@ -31,8 +31,8 @@ _REJOIN_S = 4.0
 # A vehicle that holds its position in gusts of 8 m/s stays below this.
 AT_REST_M_S = 0.5
 # Landing distance to another robot, by both robots' estimates, which may differ by 6 m.
-_BESIDE_M, _ESTIMATES_ERR_M = 8.0, 6.0
-_NEAR_M = _BESIDE_M + _ESTIMATES_ERR_M
+_LANDING_APART_M, _ESTIMATES_ERR_M = 8.0, 6.0
+_NEAR_M = _LANDING_APART_M + _ESTIMATES_ERR_M
 _STEP_S = 0.06
 # Motors may start this long after the answer to a command.
 _ARMED_AFTER_S = 1.0
@@ -169,10 +169,10 @@ class Bound(ABC):
             track = flight.vehicles[robot].between(since_s + self.from_s, since_s + self.until_s)
             values.append(self.measure(Part(flight, robot, track, since_s)))
         limit, at_least = self.limit_in(flight), cls.worst is min
-        return Figure(self.told_as, cls.worst(values), limit, self.unit, at_least)
+        return Figure(self.figure_name, cls.worst(values), limit, self.unit, at_least)
 
     @property
-    def told_as(self) -> str:
+    def figure_name(self) -> str:
         """Name of the figure."""
         return self.name
 
@@ -204,7 +204,7 @@ class Apart(Always, name="true separation", unit="m", worst=min):
         return min([math.inf, *(_least_distance_m(part.track, other) for other in others)])
 
 
-class AllKnown(Always, name="what is not a number", worst=sum):
+class AllKnown(Always, name="values that are not numbers", worst=sum):
     """The true track is known throughout: NaN would break no other bound."""
 
     def measure(self, part: Part) -> float:
@@ -223,7 +223,7 @@ class InsideFence(Always, name="true fence margin", unit="m", worst=min):
         return min([math.inf, *(float(edges.distances_m(place_m).min()) for place_m in flown_m)])
 
 
-class CarriedBeyond(InsideFence, name="true fence margin of who is carried", unit="m", worst=min):
+class CarriedBeyond(InsideFence, name="true fence margin, carried robots", unit="m", worst=min):
     """The fault itself carries vehicles no further beyond the fence."""
 
 
@@ -308,7 +308,7 @@ class FewCommands(Always):
     within_s: float = 1.0
 
     @property
-    def told_as(self) -> str:
+    def figure_name(self) -> str:
         return f"commands within {self.within_s:g} s"
 
     def measure(self, part: Part) -> float:
@@ -392,7 +392,7 @@ class StraightDown(Bound, name="drift while it lands", unit="m"):
 class LandApart(Always, name="landed apart", unit="m", worst=min):
     """Landing vehicles avoid each other."""
 
-    limit: float = _BESIDE_M - _ESTIMATES_ERR_M
+    limit: float = _LANDING_APART_M - _ESTIMATES_ERR_M
 
     def measure(self, part: Part) -> float:
         vehicles = part.flight.vehicles
@@ -412,12 +412,12 @@ class LandsAtPad(Bound, name="from its pad", unit="m"):
         pads_m = part.flight.fault.pads_m
         places_m = [vehicle.position_m[-1, :2] for vehicle in part.flight.vehicles]
         away_m = [math.dist(*each) for each in zip(places_m, pads_m, strict=False)]
-        is_beside = any(
-            away > self.limit and math.dist(stray_m, pads_m[part.robot]) < _NEAR_M
-            for robot, (stray_m, away) in enumerate(zip(places_m, away_m, strict=False))
+        is_displaced = any(
+            away > self.limit and math.dist(other_m, pads_m[part.robot]) < _NEAR_M
+            for robot, (other_m, away) in enumerate(zip(places_m, away_m, strict=False))
             if robot != part.robot
         )
-        return away_m[part.robot] - (_BESIDE_M if is_beside else 0.0)
+        return away_m[part.robot] - (_LANDING_APART_M if is_displaced else 0.0)
 
 
 class FliesOn(Bound, name="share of the mission", worst=min, start=1.0):

@@ -892,7 +892,7 @@ _FAULTS = (
         "pad-taken-before", "stands beside another's landing point",
         "the other does not take off",
         # It stays there: its own battery is too low for a takeoff.
-        does=(Do(do.carry_to_pad(beside_m=2.0)), Do(do.change_battery(0.30))),
+        does=(Do(do.carry_to_pad(offset_m=2.0)), Do(do.change_battery(0.30))),
         bounds=(StaysDown(), StaysDown(robots="next")), phase="ready", watched_s=30.0, exact=True,
     ),
     Fault(

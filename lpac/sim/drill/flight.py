@@ -10,9 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from lpac.analysis.snapshot import FleetSnapshot
-from lpac.ground.procedure import NoSnapshotError, Procedure, Until
+from lpac.ground.procedure import Procedure, Until
 from lpac.ground.station.protocol import (
-    CommandReport,
     Enable,
     Request,
     SafetyCommand,
@@ -31,7 +30,7 @@ _BEGINS_S: Mapping[Phase, tuple[float, float]] = {
 }  # fmt: skip
 # From a fault on the ground until the operator takes off: the robots' checks have run by then.
 _NOTICED_S = 8.0
-_HEARD_S, _READY_S = 30.0, 60.0
+_CONNECTED_S, _READY_S = 30.0, 60.0
 # From the highest height of a large fleet down, at PX4's slowest.
 _ALL_DOWN_S = 200.0
 
@@ -46,7 +45,7 @@ def drawn(fault: Fault, seed: int, robots: int) -> tuple[tuple[int, ...], float]
 
 def to_ready(field: FaultyFleet) -> Procedure[None]:
     """Procedure until all robots are connected and have passed their checks."""
-    yield Until(lambda told: all(robot.fresh for robot in told.robots), _HEARD_S)
+    yield Until(lambda snapshot: all(robot.fresh for robot in snapshot.robots), _CONNECTED_S)
     for request in (SetOrigin(ORIGIN), Enable()):
         yield from _command(field, request)
     yield Until(_all_ready, _READY_S)
@@ -83,23 +82,17 @@ def fly(field: FaultyFleet, fault: Fault, scenario: Scenario) -> Procedure[Timel
     return Timeline(hit, fault_s, marks)
 
 
-def _command(field: FaultyFleet, request: Request) -> Procedure[CommandReport | None]:
-    """Report of the command; None without a ground station, or on timeout."""
-    if not field.ground_runs:
-        return None
-    answered = field.noted(request)
-    try:
-        report: CommandReport = yield request
-    except NoSnapshotError:
-        return None
-    finally:
+def _command(field: FaultyFleet, request: Request) -> Procedure[None]:
+    """Send a command, if the ground runs, and wait for its report or a timeout."""
+    if field.ground_runs:
+        answered = field.noted(request)
+        yield request
         answered()
-    return report
 
 
 def _wait(seconds: float) -> Procedure[None]:
     yield Until(lambda _: False, seconds)
 
 
-def _all_ready(told: FleetSnapshot) -> bool:
-    return all(robot.status is not None and robot.status.ready for robot in told.robots)
+def _all_ready(snapshot: FleetSnapshot) -> bool:
+    return all(robot.status is not None and robot.status.ready for robot in snapshot.robots)

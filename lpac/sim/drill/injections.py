@@ -222,12 +222,12 @@ def set_parameter(
 
 @_on_vehicle
 def carry_to_pad(
-    vehicle: Px4Vehicle, robot: int, around: Surroundings, to_pad: int = 1, beside_m: float = 0.0
+    vehicle: Px4Vehicle, robot: int, around: Surroundings, to_pad: int = 1, offset_m: float = 0.0
 ) -> None:
-    """Carry a disarmed vehicle to the pad of robot + `to_pad`, or `beside_m` north of it."""
+    """Carry a disarmed vehicle to the pad of robot + `to_pad`, or `offset_m` north of it."""
     if not vehicle.armed:
         north_m, east_m = around.place_m(robot + to_pad).tolist()
-        vehicle.position_m = np.array([north_m + beside_m, east_m, 0.0])
+        vehicle.position_m = np.array([north_m + offset_m, east_m, 0.0])
 
 
 @_on_vehicle

@@ -11,7 +11,7 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from types import TracebackType
 from typing import Self, TypeVar
@@ -21,7 +21,7 @@ from lpac.analysis.flight import FlightRecord
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import Ground, NoSnapshotError, Procedure, Until, carry_out
 from lpac.ground.station.client import GroundError
-from lpac.ground.station.protocol import CommandReport, Request
+from lpac.ground.station.protocol import Request
 from lpac.sim.drill import injections
 from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.field import FaultyFleet, Timeline, has_remote_control
@@ -72,7 +72,7 @@ _KILLED_S = 10.0
 # A laptop needs less than half of it; a longer start counts as lateness.
 _GROUND_STARTS_WITHIN_S = 2.0
 # Delay until PX4 (v1.17) reports a battery below 25 % or 15 %, after a fall to 0.5 % less.
-_BATTERY_TOLD_S = 5.5
+_BATTERY_REPORTED_S = 5.5
 
 T = TypeVar("T")
 
@@ -118,7 +118,7 @@ class ProcessField(FaultyFleet):
     @property
     def ground(self) -> Ground:
         """The operator's ground station, as last reported."""
-        return self._ground.told
+        return self._ground.subscriber
 
     @property
     def ground_runs(self) -> bool:
@@ -128,7 +128,7 @@ class ProcessField(FaultyFleet):
         self._at(self.now_s() + after_s, partial(self.happen, do, hit))
 
     def carry_out(self, procedure: Procedure[T]) -> T:
-        """Run a procedure; a command that times out is answered by None.
+        """Run a procedure, which goes on after a command that times out.
 
         Raises the error of a failed injection, OverloadError or VehicleError.
         """
@@ -148,10 +148,8 @@ class ProcessField(FaultyFleet):
 
         def command() -> None:
             # The ground station may end before it answers.
-            try:
+            with suppress(GroundError):
                 self._ground.command(request)
-            except GroundError:
-                return
 
         if self.ground_runs:
             threading.Thread(target=command, name="operator", daemon=True).start()
@@ -204,9 +202,9 @@ class ProcessField(FaultyFleet):
         late_s = [self.vehicles_late_s(began_s), self._ground_late_s]
         for robot in self.robots_by_name.values():
             overruns = [
-                heard.status.loops["control"].overruns
-                for heard in self.fleet.heard.history(robot)
-                if heard.at_s >= began_s and "control" in heard.status.loops
+                received.status.loops["control"].overruns
+                for received in self.fleet.listener.history(robot)
+                if received.at_s >= began_s and "control" in received.status.loops
             ]
             if overruns and robot not in self._stopped:
                 late_s.append((overruns[-1] - overruns[0]) / Rates().control_hz)
@@ -272,7 +270,7 @@ class ProcessField(FaultyFleet):
                     return False
                 self.stepped.wait(_LOOK_S)
 
-    def _command(self, request: Request) -> CommandReport | None:
+    def _command(self, request: Request) -> None:
         end_s = time.monotonic() + _PATIENCE_S * len(self.fleet.robots)
 
         def look() -> None:
@@ -280,10 +278,8 @@ class ProcessField(FaultyFleet):
             if time.monotonic() > end_s:
                 raise NoSnapshotError
 
-        try:
-            return self._ground.command(request, look)
-        except (GroundError, NoSnapshotError):
-            return None
+        with suppress(GroundError, NoSnapshotError):
+            self._ground.command(request, look)
 
     def _look(self) -> None:
         if self._failed is not None:
@@ -341,7 +337,7 @@ class Px4Field(ProcessField):
     def lead_s(self, injection: Injection) -> float:
         """PX4's filter delays its report of a sudden drop of the battery."""
         is_drain = isinstance(injection, OnVehicle) and injection.kind is injections.drain
-        return _BATTERY_TOLD_S if is_drain else 0.0
+        return _BATTERY_REPORTED_S if is_drain else 0.0
 
     def now_s(self) -> float:
         """Time since the creation, s."""

@@ -7,14 +7,14 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, assert_never, get_args
+from typing import NamedTuple, TypeVar, assert_never, get_args
 
 import numpy as np
 
 from edge.core import F64
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.truth import TrueTrack
-from lpac.ground.procedure import NoSnapshotError, Procedure, Until, carry_out
+from lpac.ground.procedure import NoSnapshotError, Procedure, carry_out
 from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
 from lpac.sim.air import GROUND
 from lpac.sim.drill.faults import FAULTS, Fault
@@ -46,7 +46,7 @@ from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.scenario import WORLD_SENSOR, Scenario
 
 # How far a second program's vehicle stands from the first.
-_BESIDE_M = 3.0
+_SECOND_VEHICLE_M = 3.0
 # The other operator.
 _SECOND = "second"
 SUPPORTED: tuple[object, ...] = get_args(Injection)
@@ -95,13 +95,14 @@ class SimulatedField(FaultyFleet):
         )
 
     def carry_out(self, procedure: Procedure[T]) -> T:
-        """Run a procedure; a command that times out is answered by None."""
+        """Run a procedure, which goes on after a command that times out."""
 
-        def answer(wanted: Request | Until) -> Any:
+        # `self.ground` changes when the ground restarts.
+        def command(request: Request) -> None:
             with suppress(NoSnapshotError):
-                return self.ground.carry_out(_one(wanted))
+                self.ground.command(request)
 
-        return carry_out(procedure, answer, answer)
+        return carry_out(procedure, command, lambda until: self.ground.wait(until))
 
     @property
     def vehicles(self) -> Sequence[Px4Vehicle]:
@@ -193,7 +194,7 @@ class SimulatedField(FaultyFleet):
 
     def _start_second(self, robot: int) -> None:
         places_m = np.array([each.vehicle.position_m[:2] for each in self.fleet.vehicles])
-        start_m = _beside_m(places_m, robot)
+        start_m = _clear_place_m(places_m, robot)
         vehicle = Px4Vehicle(seed=robot, start_m=start_m, origin=WORLD)
         direct = DirectVehicle(vehicle, robot + 1, self.fleet.schedule)
         self.fleet.second_program(robot, direct).start()
@@ -258,15 +259,10 @@ class SimulatedDrill:
         return field
 
 
-def _one(wanted: Any) -> Procedure[Any]:
-    answer = yield wanted
-    return answer
-
-
-def _beside_m(places_m: F64, robot: int) -> tuple[float, float]:
+def _clear_place_m(places_m: F64, robot: int) -> tuple[float, float]:
     """A place near the robot's, clear of the others at `places_m` (N, 2)."""
     angles_rad = np.arange(8) * (math.pi / 4.0)
-    around_m = places_m[robot] + _BESIDE_M * np.column_stack(
+    around_m = places_m[robot] + _SECOND_VEHICLE_M * np.column_stack(
         [np.cos(angles_rad), np.sin(angles_rad)]
     )
     to_others_m = np.linalg.norm(around_m[:, None] - np.delete(places_m, robot, axis=0), axis=2)

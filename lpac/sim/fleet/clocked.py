@@ -14,8 +14,8 @@ from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.air import Air
 from lpac.sim.failure import Failure
 from lpac.sim.fleet.flight import FleetMoment, RobotUsage, flight_of
-from lpac.sim.fleet.listener import Say
-from lpac.sim.fleet.pilot import LOOKS_S, Pilot, perturbations
+from lpac.sim.fleet.listener import Report
+from lpac.sim.fleet.pilot import LOOK_PERIOD_S, Pilot, perturbations
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.fleet.vehicles import track_of
@@ -30,7 +30,7 @@ def fly_simulated(
     scenario: Scenario,
     folder: Path | str,
     bundle: Path | str,
-    say: Say = lambda _: None,
+    report: Report = lambda _: None,
     watch: Callable[[FleetMoment], object] | None = None,
     *,
     logs: bool = False,
@@ -38,11 +38,11 @@ def fly_simulated(
 ) -> FlightRecord:
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
-    Robots read the bundle at the path `bundle`; `say` gets each step of the script with its start
-    on the simulated clock. With `logs` the robots write logs to robots/ID/logs in `folder`;
-    `recorded` is the folder of such a flight, whose policy outputs are replayed. The record's
-    `problem` says why the script did not reach its end. The robots' log messages are hidden, except
-    errors.
+    Robots read the bundle at the path `bundle`; `report` gets each step of the script with its
+    start on the simulated clock. With `logs` the robots write logs to robots/ID/logs in `folder`.
+    `recorded` is the folder of such a flight, whose policy outputs are replayed. The `problem` of
+    the record says why the script did not reach its end. Of the robots' log messages only errors
+    are shown.
 
     Raises BundleError, ValueError for too little room for the pads and for fields that whole robots
     do not support, OSError for a folder that cannot be written, RecordingError, and PartError if a
@@ -50,14 +50,14 @@ def fly_simulated(
     """
     # The log messages of ten robots would drown the output.
     with errors_only():
-        return _fly(scenario, Path(folder).resolve(), Path(bundle), say, watch, logs, recorded)
+        return _fly(scenario, Path(folder).resolve(), Path(bundle), report, watch, logs, recorded)
 
 
 def _fly(
     scenario: Scenario,
     folder: Path,
     bundle: Path,
-    say: Say,
+    report: Report,
     watch: Callable[[FleetMoment], object] | None,
     logs: bool,
     recorded: Path | None,
@@ -78,11 +78,11 @@ def _fly(
     for each in fleet.vehicles:
         each.vehicle.rc_connected = bool(scenario.failures)
 
-    def say_when(text: str) -> None:
-        say(f"{ground.now_s:6.1f} s  {text}")
+    def report_timed(text: str) -> None:
+        report(f"{ground.now_s:6.1f} s  {text}")
 
     def begin(step: str) -> None:
-        say_when(step)
+        report_timed(step)
         if step == "mission":
             if scenario.loss or scenario.delay_s:
                 delay_s = max(scenario.delay_s, Air().delay_s)
@@ -93,22 +93,22 @@ def _fly(
     def fly_by_hand(failure: Failure) -> None:
         robot, vehicle = fleet.robots[failure.robot], fleet.vehicles[failure.robot].vehicle
         pilot = Pilot(vehicle, fleet.layout, failure, ground.now_s)
-        fleet.schedule.every(LOOKS_S, lambda: pilot.look(ground.now_s, robot.status))
+        fleet.schedule.every(LOOK_PERIOD_S, lambda: pilot.look(ground.now_s, robot.status))
 
     flight = ScriptedFlight(
         ground, folder / "fleet.toml", scenario.duration_s,
         perturb=perturbations(scenario.failures),
-        on_step=begin, say=say_when,
+        on_step=begin, report=report_timed,
     )  # fmt: skip
     if watch is not None:
         fleet.schedule.every(SAMPLE_S, lambda: watch(_moment(fleet, flight)))
-    notes = _Notes(fleet)
+    statuses = _StatusLog(fleet)
     try:
         problem = ground.carry_out(flight.fly())
     except NoSnapshotError as error:
         problem = str(error)
     fleet.close()
-    return notes.flight(flight, problem, earlier, folder if logs else None)
+    return statuses.flight(flight, problem, earlier, folder if logs else None)
 
 
 def _moment(fleet: SimulatedFleet, flight: ScriptedFlight) -> FleetMoment:
@@ -120,20 +120,20 @@ def _moment(fleet: SimulatedFleet, flight: ScriptedFlight) -> FleetMoment:
     )  # fmt: skip
 
 
-class _Notes:
+class _StatusLog:
     """Statuses of each robot, as its own log has them."""
 
     def __init__(self, fleet: SimulatedFleet) -> None:
         self._fleet = fleet
-        self._said: dict[tuple[int, int, int], RobotStatus] = {}
+        self._statuses: dict[tuple[int, int, int], RobotStatus] = {}
         # More often than a robot publishes its status.
         fleet.schedule.every(SNAPSHOT_PERIOD_S, self._look)
 
     def _look(self) -> None:
         for robot in self._fleet.robots:
-            said = robot.status
-            if said is not None:
-                self._said[said.robot_id, said.boot_nonce, said.sequence] = said
+            status = robot.status
+            if status is not None:
+                self._statuses[status.robot_id, status.boot_nonce, status.sequence] = status
 
     def flight(
         self, flown: ScriptedFlight, problem: str | None, earlier: set[Path], logged: Path | None
@@ -143,7 +143,7 @@ class _Notes:
         logs = sorted(set(fleet.folder.rglob("*.mcap")) - earlier)
         return flight_of(
             fleet.layout,
-            logs_of(self._said.values()),
+            logs_of(self._statuses.values()),
             [track_of(each.vehicle.truth) for each in fleet.vehicles],
             fleet.schedule.unix_s() - fleet.schedule.monotonic_s(),
             0.0,
@@ -162,6 +162,6 @@ class _Notes:
                 vehicle="simulated",
                 began_s=flown.began_s | {"end": fleet.ground.now_s},
                 problem=problem,
-                commands=flown.told_commands(),
+                commands=flown.recorded_commands(),
             ),
         )

@@ -24,7 +24,7 @@ from lpac.ground.station.client import GroundError
 from lpac.sim.description import FIELD_SCALE
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import WORLD, Layout
-from lpac.sim.fleet.listener import Say, Statuses
+from lpac.sim.fleet.listener import Report, Statuses
 from lpac.sim.fleet.pilot import Pilot, perturbations
 from lpac.sim.fleet.processes import Backlog, Fleet, OverloadError, Usage, process_usage
 from lpac.sim.fleet.scripted import ScriptedFlight
@@ -48,7 +48,7 @@ class FleetMoment:
 
 def fly_programs(
     fleet: Fleet,
-    say: Say = lambda _: None,
+    report: Report = lambda _: None,
     watch: Callable[[FleetMoment], object] = lambda _: None,
 ) -> FlightRecord:
     """Run a fleet and its ground, and fly the script; `watch` is called several times a second.
@@ -63,7 +63,7 @@ def fly_programs(
     with (
         fleet,
         GroundProgram(fleet.fleet_toml, fleet.name) as ground,
-        _in_sight(fleet) if scenario.failures else nullcontext() as seen,
+        _piloted_vehicles(fleet) if scenario.failures else nullcontext() as seen,
     ):
         if seen is not None:
             with seen.stepped:
@@ -73,10 +73,10 @@ def fly_programs(
         def begin(name: str) -> None:
             if name == "preflight":
                 fleet.begin()
-            say("landing all robots where they are" if name == "land" else name)
+            report("landing all robots where they are" if name == "land" else name)
             moments.setdefault(name, _Moment.of(fleet, ground))
             if name == "mission" and seen is not None:
-                now_s = ground.told.now_s
+                now_s = ground.subscriber.now_s
                 flying_by_hand[:] = [
                     Pilot(seen.vehicles[failure.robot], fleet.layout, failure, now_s)
                     for failure in scenario.failures
@@ -90,28 +90,28 @@ def fly_programs(
             if flight.at not in ("assemble", "land"):
                 fleet.require_keeping_up()
             if seen is not None and flight.at == "mission":
-                told = ground.told.snapshot.robots
+                robots = ground.subscriber.snapshot.robots
                 with seen.stepped:
                     for pilot in flying_by_hand:
-                        pilot.look(ground.told.now_s, told[pilot.robot].status)
+                        pilot.look(ground.subscriber.now_s, robots[pilot.robot].status)
             show()
 
         def show() -> None:
-            time_s = ground.told.now_s - flight.began_s["assemble"]
-            watch(FleetMoment(time_s, flight.at, fleet.heard.statuses(), flight.stop))
+            time_s = ground.subscriber.now_s - flight.began_s["assemble"]
+            watch(FleetMoment(time_s, flight.at, fleet.listener.statuses(), flight.stop))
 
         flight = ScriptedFlight(
-            ground.told, fleet.fleet_toml, scenario.duration_s,
+            ground.subscriber, fleet.fleet_toml, scenario.duration_s,
             perturb=perturbations(scenario.failures),
-            on_step=begin, say=fleet.say_unless_behind,
+            on_step=begin, report=fleet.report_unless_behind,
         )  # fmt: skip
         try:
             try:
-                problem = ground.told.carry_out(flight.fly(), look)
+                problem = ground.subscriber.carry_out(flight.fly(), look)
             except GroundError:
                 raise
             except BaseException:
-                ground.told.carry_out(flight.land(), show)
+                ground.subscriber.carry_out(flight.land(), show)
                 raise
         except (OverloadError, VehicleError, GroundError) as error:
             problem, overloaded = str(error), isinstance(error, OverloadError)
@@ -124,7 +124,7 @@ def fly_programs(
 
 
 @contextmanager
-def _in_sight(fleet: Fleet) -> Iterator[SimulatedVehicles | RealVehicles]:
+def _piloted_vehicles(fleet: Fleet) -> Iterator[SimulatedVehicles | RealVehicles]:
     """The vehicles, as pilots see and fly them."""
     if fleet.simulated is not None:
         yield fleet.simulated
@@ -190,7 +190,7 @@ def _record(
             vehicle="px4" if fleet.simulated is None else "mavlink",
             began_s=began_s,
             problem=problem,
-            commands=flight.told_commands(),
+            commands=flight.recorded_commands(),
             launcher=(
                 _share(first, last, first.launcher, last.launcher),
                 moments["end"].launcher.peak_memory_mb,
@@ -261,12 +261,12 @@ def flight_of(
 
 
 def _program(
-    said: list[LoggedStatus], record: FlightRecord, start_unix_s: float, usage: RobotUsage
+    statuses: list[LoggedStatus], record: FlightRecord, start_unix_s: float, usage: RobotUsage
 ) -> ProgramRecord:
     end_s = record.begin_s + record.duration_s if record.flew_mission else math.inf
-    past = [each for each in said if each.time_s <= end_s]
+    past = [each for each in statuses if each.time_s <= end_s]
     return ProgramRecord(
-        changes_of([each.time_s - start_unix_s for each in said], said),
+        changes_of([each.time_s - start_unix_s for each in statuses], statuses),
         past[-1] if past else None,
         *usage,
     )

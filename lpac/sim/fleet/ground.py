@@ -17,7 +17,7 @@ _TRY_AGAIN_S = 0.05
 
 
 class GroundProgram(LpacProgram):
-    """One `lpac ground`; a context, in which it runs. `told` subscribes to its reports.
+    """One `lpac ground`; a context, in which it runs. `subscriber` receives its reports.
 
     Its output goes to ground.log next to the fleet's file.
     """
@@ -29,7 +29,7 @@ class GroundProgram(LpacProgram):
             "ground", "--fleet", str(fleet_toml), "--name", name,
         )  # fmt: skip
         self.fleet = fleet
-        self._told: GroundSubscriber | None = None
+        self._subscriber: GroundSubscriber | None = None
 
     def __enter__(self) -> Self:
         """Start it, and wait for its first report. Raises GroundError if it does not start."""
@@ -44,10 +44,10 @@ class GroundProgram(LpacProgram):
         self._end()
 
     @property
-    def told(self) -> GroundSubscriber:
+    def subscriber(self) -> GroundSubscriber:
         """Subscriber to the ground station, while it runs."""
-        assert self._told is not None
-        return self._told
+        assert self._subscriber is not None
+        return self._subscriber
 
     def command(
         self, request: Request, meanwhile: Callable[[], None] = lambda: None
@@ -74,10 +74,10 @@ class GroundProgram(LpacProgram):
 
     def _listen(self) -> None:
         """Connect again, since subscribers give up a silent ground station."""
-        told = self._connected()
-        if self._told is not None:
-            self._told.__exit__(None, None, None)
-        self._told = told
+        subscriber = self._connected()
+        if self._subscriber is not None:
+            self._subscriber.__exit__(None, None, None)
+        self._subscriber = subscriber
 
     def _connected(self) -> GroundSubscriber:
         until_s = time.monotonic() + _START_WITHIN_S
@@ -87,13 +87,13 @@ class GroundProgram(LpacProgram):
             except GroundError:
                 # The socket does not exist yet, and nothing signals when it does.
                 if not self.running or time.monotonic() > until_s:
-                    text = f"`lpac ground` does not start: {self.last_words()}"
+                    text = f"`lpac ground` does not start: {self.last_output()}"
                     raise GroundError(text) from None
                 time.sleep(_TRY_AGAIN_S)
 
     def _end(self) -> None:
-        if self._told is not None:
-            self._told.__exit__(None, None, None)
+        if self._subscriber is not None:
+            self._subscriber.__exit__(None, None, None)
         if self.running:
             self.terminate()
             if self.wait(_END_WITHIN_S) is None:

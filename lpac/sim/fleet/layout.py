@@ -241,7 +241,8 @@ class Layout:
             if not self.scenario.errors:
                 vehicle.gps_bias_m = ZERO
                 # At most half of the position error, as a receiver with corrections reports.
-                vehicle.gps_accuracy_override_m = min(GPS_ACCURACY_M[0], self.scenario.budget.gps_m / 2.0)
+                accuracy_m = min(GPS_ACCURACY_M[0], self.scenario.budget.gps_m / 2.0)
+                vehicle.gps_accuracy_override_m = accuracy_m
             vehicles.append(vehicle)
         return pads_m, pads_m + biases_m, tuple(vehicles)
 

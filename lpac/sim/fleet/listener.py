@@ -17,10 +17,10 @@ from lpac.analysis.snapshot import FRESH_S
 _LOOK_AGAIN_S = 0.2
 
 Statuses = Mapping[int, RobotStatus]
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 
 
-class Heard(NamedTuple):
+class ReceivedStatus(NamedTuple):
     """A status, and the `time.monotonic()` of its arrival."""
 
     at_s: float
@@ -39,17 +39,17 @@ class FleetListener:
         fleet: str,
         connect: Sequence[str],
         identity: Path | None = None,
-        say: Say = lambda _: None,
+        report: Report = lambda _: None,
     ) -> None:
         """`connect` are the robots' endpoints; `identity` is the folder with its own keys, in a
-        secure fleet; `say` gets malformed messages, from another thread.
+        secure fleet; `report` gets malformed messages, from another thread.
         """
         self._fleet = fleet
         self._identity = identity
         self._connect = tuple(connect)
-        self._say = say
+        self._report = report
         self._changed = threading.Condition()
-        self._heard: dict[int, list[Heard]] = {}
+        self._statuses: dict[int, list[ReceivedStatus]] = {}
         self._link: ZenohLink | None = None
 
     def __enter__(self) -> Self:
@@ -63,7 +63,7 @@ class FleetListener:
             fleet=self._fleet,
             listen=(f"{scheme}/127.0.0.1:0",),
             connect=self._connect,
-            subscriptions=guard.subscriptions({STATUS: self._hear}),
+            subscriptions=guard.subscriptions({STATUS: self._receive}),
             tls=tls,
         )
         return self
@@ -76,19 +76,19 @@ class FleetListener:
         """The newest status of each robot with a fresh one, by robot id."""
         earliest_s = time.monotonic() - FRESH_S
         with self._changed:
-            newest = {robot: heard[-1] for robot, heard in self._heard.items()}
-        return {robot: heard.status for robot, heard in newest.items() if heard.at_s >= earliest_s}
+            newest = {robot: received[-1] for robot, received in self._statuses.items()}
+        return {robot: last.status for robot, last in newest.items() if last.at_s >= earliest_s}
 
-    def history(self, robot: int) -> tuple[Heard, ...]:
+    def history(self, robot: int) -> tuple[ReceivedStatus, ...]:
         """All statuses of a robot, in order."""
         with self._changed:
-            return tuple(self._heard.get(robot, ()))
+            return tuple(self._statuses.get(robot, ()))
 
     def forget(self) -> None:
         """Keep only the last status of each robot."""
         with self._changed:
-            for heard in self._heard.values():
-                del heard[:-1]
+            for received in self._statuses.values():
+                del received[:-1]
 
     def wait_for(self, condition: Callable[[Statuses], bool], timeout_s: float) -> bool:
         """Wait until `condition` holds; False on timeout."""
@@ -102,13 +102,13 @@ class FleetListener:
                 self._changed.wait(min(left_s, _LOOK_AGAIN_S))
         return True
 
-    def _hear(self, _: str, data: bytes, __: Sender) -> None:
+    def _receive(self, _: str, data: bytes, __: Sender) -> None:
         at_s = time.monotonic()
         try:
             status = decode(RobotStatus, data)
         except MessageError as error:
-            self._say(f"a status is malformed: {error}")
+            self._report(f"a status is malformed: {error}")
             return
         with self._changed:
-            self._heard.setdefault(status.robot_id, []).append(Heard(at_s, status))
+            self._statuses.setdefault(status.robot_id, []).append(ReceivedStatus(at_s, status))
             self._changed.notify_all()

@@ -50,5 +50,5 @@ class SimulatedMembers:
         for guard in self._guards:
             guard.update_members(self.list)
 
-    def _signer(self, whose: str) -> Signer:
-        return Signer(hashlib.sha256(f"{self._fleet} {whose}".encode()).digest())
+    def _signer(self, owner: str) -> Signer:
+        return Signer(hashlib.sha256(f"{self._fleet} {owner}".encode()).digest())

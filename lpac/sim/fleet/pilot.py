@@ -12,7 +12,7 @@ from lpac.sim.failure import Failure
 from lpac.sim.fleet.layout import Layout
 from lpac.sim.px4.modes import Px4Mode
 
-LOOKS_S = 0.1
+LOOK_PERIOD_S = 0.1
 _GAIN_PER_S, _FASTEST_M_S = 0.8, 3.0
 # Distance beyond the fence; times before the end at which the pilot turns back, and lets go.
 _BEYOND_M = 2.0
@@ -69,7 +69,7 @@ class Pilot:
         self._out_m: F64 = np.zeros(3)
         self._over = False
 
-    def look(self, now_s: float, said: RobotStatus | None) -> None:
+    def look(self, now_s: float, status: RobotStatus | None) -> None:
         """Act; to be called several times a second with the robot's last status, if any.
 
         The pilot takes over once the status says PILOT.
@@ -82,7 +82,7 @@ class Pilot:
             self._over = True
         elif self._taken_at_m is not None:
             self._fly_to(self._out_m if left_s > _BACK_S else self._taken_at_m)
-        elif said is not None and said.state is FlightState.PILOT:
+        elif status is not None and status.state is FlightState.PILOT:
             self._take()
 
     def _take(self) -> None:

@@ -15,7 +15,7 @@ from edge.core.counted import counted
 from edge.robot.config import Rates
 from lpac.sim.fleet.keys import write_keys
 from lpac.sim.fleet.layout import WORLD, Layout, Settings
-from lpac.sim.fleet.listener import FleetListener, Say
+from lpac.sim.fleet.listener import FleetListener, Report
 from lpac.sim.fleet.vehicles import SimulatedVehicles, Vehicles
 from lpac.sim.ports import free_ports
 from lpac.sim.programs import LpacProgram
@@ -124,9 +124,9 @@ def process_usage(pid: int) -> Usage:
 class Fleet:
     """Vehicles and robots, without a ground station: a context, in which all of them run.
 
-    `robots[i]` is robot i's process, `heard` has their statuses. `simulated` gives access to
-    simulated vehicles; None for real PX4s. `endpoints` are the robots' zenoh addresses, `name` is
-    the fleet's. `carried`, set by the caller, is how many robots this machine can run.
+    `robots[i]` is robot i's process, `listener` receives their statuses. `simulated` gives access
+    to simulated vehicles; None for real PX4s. `endpoints` are the robots' zenoh addresses, `name`
+    is the fleet's. `carried`, set by the caller, is how many robots this machine can run.
     `fleet_toml` describes the fleet to `lpac ground`, as if its robots were in the field.
     """
 
@@ -138,7 +138,7 @@ class Fleet:
         *,
         px4_build: Path | None = None,
         settings: Settings | None = None,
-        say: Say = lambda _: None,
+        report: Report = lambda _: None,
     ) -> None:
         """Prepare the fleet in `folder`: fleet.toml, world, a folder per robot. Starts nothing.
 
@@ -171,13 +171,13 @@ class Fleet:
             for robot in range(scenario.robots)
         )
         self.carried: int | None = None
-        self._say = say
+        self._report = report
         keys = write_keys(self.folder, self.name, scenario.robots) if scenario.secure else None
-        self.heard = FleetListener(
+        self.listener = FleetListener(
             fleet=self.name,
             connect=self.endpoints,
             identity=keys,
-            say=self.say_unless_behind,
+            report=self.report_unless_behind,
         )
         self._late_before = Backlog(0.0, 0.0)
         self._latenesses = deque([(-math.inf, self._late_before)])
@@ -204,7 +204,7 @@ class Fleet:
         """Start everything. Raises OSError or LinkError if a port is taken."""
         with ExitStack() as stack:
             stack.enter_context(self.vehicles)
-            stack.enter_context(self.heard)
+            stack.enter_context(self.listener)
             stack.callback(self._stop_robots)
             for robot in self.robots:
                 robot.start()
@@ -242,15 +242,15 @@ class Fleet:
         control_s = 1.0 / Rates().control_hz
         left_out_s = [
             control_s * status.loops["control"].overruns
-            for status in self.heard.statuses().values()
+            for status in self.listener.statuses().values()
             if "control" in status.loops
         ]
         return Backlog(self.vehicles.lost_s(), float(np.median(left_out_s or [0.0])))
 
-    def say_unless_behind(self, text: str) -> None:
+    def report_unless_behind(self, text: str) -> None:
         """Report what robots do, unless it may follow from an overloaded machine."""
         if max(self._recent_lateness()) < DOUBTFUL_S:
-            self._say(text)
+            self._report(text)
 
     def _recent_lateness(self) -> "Backlog":
         """Lateness within the last `_WHILE_S`."""
@@ -263,7 +263,7 @@ class Fleet:
 
     def forget(self) -> None:
         """Drop the history, which only the figures of a flight need."""
-        self.heard.forget()
+        self.listener.forget()
         self.vehicles.forget()
 
     def _stop_robots(self) -> None:
@@ -273,5 +273,5 @@ class Fleet:
         until_s = time.monotonic() + STOP_WITHIN_S
         for robot in running:
             if robot.wait(max(0.0, until_s - time.monotonic())) is None:
-                self._say(f"{robot.name} did not end within {STOP_WITHIN_S:g} s: killed")
+                self._report(f"{robot.name} did not end within {STOP_WITHIN_S:g} s: killed")
                 robot.kill()

@@ -76,7 +76,7 @@ class SimulatedRobot:
         self.node: RobotNode | None = None
         self.watchdog: SimulatedWatchdog | None = None
         self._disk = _Disk()
-        self._said: RobotStatus | None = None
+        self._last_status: RobotStatus | None = None
         self.loops: dict[str, Recurrence] = {}
         self._policy = policy
         self._sensor_over = sensor_over
@@ -92,7 +92,7 @@ class SimulatedRobot:
     @property
     def status(self) -> RobotStatus | None:
         """The last status, also after the program has ended; None before the first."""
-        return (self.node and self.node.status) or self._said
+        return (self.node and self.node.status) or self._last_status
 
     def start(self) -> None:
         """Start or restart the program."""
@@ -160,7 +160,7 @@ class SimulatedRobot:
 
     def stop(self) -> None:
         """End the program, as by a loss of power."""
-        self._said = self.status
+        self._last_status = self.status
         for loop in self.loops.values():
             loop.stop()
         if self.watchdog is not None:

@@ -38,14 +38,14 @@ from lpac.ground.station.protocol import (
 )
 from lpac.ground.station.station import is_down
 from lpac.sim.fleet.layout import ORIGIN
-from lpac.sim.fleet.listener import Say
+from lpac.sim.fleet.listener import Report
 
 _PREFLIGHT_S = 60.0
 # Time for the programs to start and connect: base, and for each robot.
 _ASSEMBLE_S, _ASSEMBLE_EACH_S = 30.0, 3.0
 # On a busy machine robots may be late to reach their heights: all land, and take off again.
 _MOST_TAKEOFFS = 3
-_TAKE_BACK_AGAIN_S = 3.0
+_REJOIN_AGAIN_S = 3.0
 
 
 class CommandOutcome(NamedTuple):
@@ -70,19 +70,19 @@ class ScriptedFlight(ScriptListener):
         *,
         perturb: tuple[Perturbation, ...] = (),
         on_step: Callable[[str], None] = lambda _: None,
-        say: Say = lambda _: None,
+        report: Report = lambda _: None,
     ) -> None:
-        """`on_step` gets each step as it begins, `say` events that are not in the script.
+        """`on_step` gets each step as it begins, `report` events that are not in the script.
 
         `perturb` is passed to `MissionStep`.
         """
         self.began_s: dict[str, float] = {}
         self.commands: list[CommandOutcome] = []
         self.at = ""
-        self._taken_back_s = -math.inf
+        self._rejoined_s = -math.inf
         self._ground = ground
         self._on_step = on_step
-        self._say = say
+        self._report = report
         script = Script(
             path=fleet_toml,
             trial="flight",
@@ -103,11 +103,11 @@ class ScriptedFlight(ScriptListener):
         """
         self.step("assemble", None)
         at_most_s = _ASSEMBLE_S + _ASSEMBLE_EACH_S * len(self._ground.setup.robots)
-        if not (yield Until(lambda told: not _silent(told), at_most_s)):
+        if not (yield Until(lambda snapshot: not _silent(snapshot), at_most_s)):
             return f"no status came from {', '.join(_silent(self._ground.snapshot))}"
         for takeoffs in range(1, _MOST_TAKEOFFS + 1):
             try:
-                yield from self._beside(self._run.fly())
+                yield from self._supervised(self._run.fly())
             except (ScriptError, NoSnapshotError) as error:
                 problem = str(error)
             else:
@@ -118,7 +118,7 @@ class ScriptedFlight(ScriptListener):
             if also is not None or "start" in self.began_s or "takeoff" not in self.began_s:
                 break
             if takeoffs < _MOST_TAKEOFFS:
-                self._say(f"all take off again: {problem}")
+                self._report(f"all take off again: {problem}")
         return problem
 
     def land(self) -> Procedure[str | None]:
@@ -126,7 +126,7 @@ class ScriptedFlight(ScriptListener):
         if all(r.status is None or is_down(r.status) for r in self._ground.snapshot.robots):
             return None
         self.step("land", None)
-        yield from self._take_back()
+        yield from self._rejoin()
         report = yield from self._command(SafetyCommand("land", wait=True))
         return None if report.done else failures(report)
 
@@ -134,7 +134,7 @@ class ScriptedFlight(ScriptListener):
         """End the mission now: all return and land."""
         self._run.mission_ends = True
 
-    def told_commands(self) -> tuple[ScriptCommand, ...]:
+    def recorded_commands(self) -> tuple[ScriptCommand, ...]:
         """`commands` for the flight record."""
         return tuple(
             ScriptCommand(
@@ -146,7 +146,7 @@ class ScriptedFlight(ScriptListener):
             for request, report in self.commands
         )
 
-    def _beside(self, script: Procedure[None]) -> Procedure[None]:
+    def _supervised(self, script: Procedure[None]) -> Procedure[None]:
         """Run the script, record its commands, and rejoin robots that left offboard."""
         answer: CommandReport | bool | None = None
         while True:
@@ -154,7 +154,7 @@ class ScriptedFlight(ScriptListener):
                 wanted = script.send(answer)
             except StopIteration:
                 return
-            yield from self._take_back()
+            yield from self._rejoin()
             if isinstance(wanted, Until):
                 answer = yield wanted
             else:
@@ -165,7 +165,7 @@ class ScriptedFlight(ScriptListener):
         self.commands.append(CommandOutcome(request, report))
         return report
 
-    def _take_back(self) -> Procedure[None]:
+    def _rejoin(self) -> Procedure[None]:
         """Rejoin vehicles that left offboard on their own, as on a busy machine.
 
         Vehicles that the script gave to a pilot are left alone.
@@ -176,10 +176,10 @@ class ScriptedFlight(ScriptListener):
             if robot.status and robot.status.state is FlightState.PILOT
             and robot.status.mode not in PILOTED and robot.name not in self._run.piloted
         )  # fmt: skip
-        if not left or self._ground.now_s - self._taken_back_s < _TAKE_BACK_AGAIN_S:
+        if not left or self._ground.now_s - self._rejoined_s < _REJOIN_AGAIN_S:
             return
-        self._taken_back_s = self._ground.now_s
-        self._say(f"{', '.join(left)} left offboard: sent rejoin")
+        self._rejoined_s = self._ground.now_s
+        self._report(f"{', '.join(left)} left offboard: sent rejoin")
         yield from self._command(RobotCommand("rejoin", left))
         if self.at == "mission":
             yield from self._command(Start(left))
@@ -192,7 +192,7 @@ class ScriptedFlight(ScriptListener):
 
     def line(self, text: str) -> None:
         """Report a line of text."""
-        self._say(text)
+        self._report(text)
 
     def confirm(self, question: str) -> bool:
         """Continue without asking: there is one trial."""

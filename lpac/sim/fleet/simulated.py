@@ -210,7 +210,7 @@ class SimulatedGround:
 
     def carry_out(self, procedure: Procedure[T]) -> T:
         """Advance the time until the procedure returns. Raises the procedure's errors."""
-        return carry_out(procedure, self.command, self._wait)
+        return carry_out(procedure, self.command, self.wait)
 
     def command(self, request: Request) -> CommandReport:
         """Run a command to its report. Raises NoSnapshotError on timeout."""
@@ -221,6 +221,15 @@ class SimulatedGround:
         if task is None or task.report is None:
             raise NoSnapshotError(f"{type(request).__name__} does not end")
         return task.report
+
+    def wait(self, until: Until) -> bool:
+        """Advance the time until the condition holds; False on timeout."""
+        end_s = self.now_s + until.at_most_s
+        while not until.condition(self._snapshot):
+            if self.now_s >= end_s:
+                return False
+            self._schedule.run_until(min(end_s, self.now_s + SNAPSHOT_PERIOD_S))
+        return True
 
     def published(self, message: ServerMessage) -> None:
         """Keep the events, and the last world on disk."""
@@ -239,14 +248,6 @@ class SimulatedGround:
     def _tick(self) -> None:
         self.node.tick()
         self._snapshot = self.node.snapshot
-
-    def _wait(self, until: Until) -> bool:
-        end_s = self.now_s + until.at_most_s
-        while not until.condition(self._snapshot):
-            if self.now_s >= end_s:
-                return False
-            self._schedule.run_until(min(end_s, self.now_s + SNAPSHOT_PERIOD_S))
-        return True
 
 
 def _copy_count(count: Any) -> tuple[Any, tuple[int]]:

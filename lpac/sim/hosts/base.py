@@ -88,7 +88,7 @@ def require_tools() -> None:
         raise NoHostsError(f"robot hosts need an x86-64 machine, this is {platform.machine()}")
 
 
-def base_tree(say: Callable[[str], None]) -> Path:
+def base_tree(report: Callable[[str], None]) -> Path:
     """The tree of `SUITE`, built if not cached; if that fails, the tree of `SECOND_SUITE`.
 
     Raises NoHostsError if neither can be built.
@@ -103,11 +103,11 @@ def base_tree(say: Callable[[str], None]) -> Path:
             tree = cache / f"{suite}-{recipe}"
             if tree.exists():
                 return tree
-            say(f"making a base system of {suite} in {cache} (once, about half a minute)")
+            report(f"making a base system of {suite} in {cache} (once, about half a minute)")
             try:
                 _make(suite, tree)
             except OSError as error:
-                say(f"no base system of {suite}: {error}")
+                report(f"no base system of {suite}: {error}")
                 reasons.append(f"{suite}: {error}")
                 continue
             for old in cache.glob(f"{suite}-*"):

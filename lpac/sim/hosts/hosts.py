@@ -25,7 +25,7 @@ MAX_HOSTS = 20
 FIELD_M = 32.0
 _MAX_SPEED_M_S = 1.25
 
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 class SimulatedHosts:
@@ -45,7 +45,7 @@ class SimulatedHosts:
         image: Path,
         bundle: Path,
         spares: int = 0,
-        say: Say = lambda _: None,
+        report: Report = lambda _: None,
     ) -> None:
         """Start nothing yet. `image` and `bundle` are written to fleet.toml, but not read.
 
@@ -64,7 +64,7 @@ class SimulatedHosts:
         self.fleet = ""
         self._count, self._spares = count, spares
         self._image, self._bundle = image.resolve(), bundle.resolve()
-        self._say = say
+        self._report = report
         self._hosts: list[SimulatedHost] = []
         self._stack = ExitStack()
 
@@ -73,7 +73,7 @@ class SimulatedHosts:
         self.folder.mkdir(parents=True, exist_ok=True)
         # Keys of earlier hosts.
         shutil.rmtree(self.folder / "keys", ignore_errors=True)
-        base = base_tree(self._say)
+        base = base_tree(self._report)
         with ExitStack() as stack:
             stack.callback(self._ended)
             rack = stack.enter_context(Rack(base))
@@ -90,7 +90,7 @@ class SimulatedHosts:
             self._write_files()
             for host in self._hosts:
                 host.await_boot()
-                self._say(f"{host.name} is up at {host.address}")
+                self._report(f"{host.name} is up at {host.address}")
             self._stack = stack.pop_all()
         return self
 

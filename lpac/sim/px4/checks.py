@@ -218,7 +218,9 @@ class HealthReporter:
         self._reported = HealthReport()
         self._reported_at_s = self._FIRST_S - self._INTERVAL_S
 
-    def update(self, report: HealthReport, now_s: float, *, on_request: bool = False) -> list[Px4Event]:
+    def update(
+        self, report: HealthReport, now_s: float, *, on_request: bool = False
+    ) -> list[Px4Event]:
         """Update the checks; returns the events that PX4 sends about them."""
         self.newest, self.checked_at_s = report, now_s
         is_due = report != self._reported and now_s >= self._reported_at_s + self._INTERVAL_S

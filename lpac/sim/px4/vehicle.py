@@ -183,7 +183,7 @@ class Px4Vehicle:
     `gps_bias_m`, `gps_lost` (the receiver runs, without satellites), `gps_jump_m` (sudden error of
     the fix, which the estimator may reject or follow, as the other faults of its `receiver`),
     `gps_offset_m` and `gps_drift_m_s` (error that fix and estimate share, and its unbounded rate),
-    `compass_jump_rad`, `gps_accuracy_override_m` (reported accuracy, instead of the receiver's own),
+    `compass_jump_rad`, `gps_accuracy_override_m` (reported instead of the receiver's own accuracy),
     `estimate_frozen` (old position and velocity are sent on), `dead_sensors` (their drivers are
     silent), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (share of thrust lost in
     flight: above 0.51 the vehicle sinks), `wire` (faults of its messages). `thrust` is the
@@ -729,9 +729,10 @@ class Px4Vehicle:
         self._events += self._reporter.before_failsafe(self.time_s)
         main, sub = CUSTOM_MODES[self.intended_mode]
         mode = struct.pack("<I", main << 16 | sub << 24)
-        number = self.battery_warning + 1 if cause is FailsafeCause.BATTERY else _CAUSES.get(cause, 0)
+        is_battery = cause is FailsafeCause.BATTERY
+        number = self.battery_warning + 1 if is_battery else _CAUSES.get(cause, 0)
         generic, cause_bytes = not number, bytes([number] if number else [])
-        if action is FailsafeAction.WARN and cause is FailsafeCause.BATTERY:
+        if action is FailsafeAction.WARN and is_battery:
             level = Level.WARNING if self.battery_warning == 2 else Level.CRITICAL
             self._emit(_BATTERY_WARNINGS[self.battery_warning], level)
         elif action is FailsafeAction.WARN:

@@ -224,12 +224,12 @@ def test_a_program_that_cannot_start_is_given_up_and_its_vehicle_landed(
 def take_off(ground: GroundProgram) -> None:
     """When it is ready; also for another time if it was held up."""
     for request in (SetOrigin(ORIGIN), Enable()):
-        assert ground.told.wait_for(lambda told: told.robots[0].fresh, 180.0)
+        assert ground.subscriber.wait_for(lambda told: told.robots[0].fresh, 180.0)
         assert ground.command(request).problem is None
     until_s = time.monotonic() + 180.0
     while not (report := ground.command(Takeoff())).done:
         assert report.problem is None and time.monotonic() < until_s, report
-        status = ground.told.snapshot.robots[0].status
+        status = ground.subscriber.snapshot.robots[0].status
         if status is not None and status.state is FlightState.HOLD:
             ground.command(SafetyCommand("land", wait=True))
 

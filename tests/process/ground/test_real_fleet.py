@@ -84,11 +84,11 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
         text = path.read_text().replace('listen = ["tcp/127.0.0.1:', OPEN)
         path.write_text(text.replace("[flight]\n", "[flight]\nground_lost_land_s = 30.0\n"))
     with made:
-        found_all = made.heard.wait_for(
+        found_all = made.listener.wait_for(
             lambda statuses: [s.state for s in statuses.values()] == [_S.IDLE] * len(NAMES),
             PATIENCE_S,
         )
-        assert found_all, made.heard.statuses()
+        assert found_all, made.listener.statuses()
         yield made
 
 
@@ -100,7 +100,7 @@ def statuses_of_all(fleet: Fleet) -> dict[int, RobotStatus]:
         heard.update(statuses)
         return len(statuses) == len(NAMES)
 
-    assert fleet.heard.wait_for(all_heard, PATIENCE_S)
+    assert fleet.listener.wait_for(all_heard, PATIENCE_S)
     return heard
 
 
@@ -109,7 +109,7 @@ class Ground:
 
     def __init__(self, fleet: Fleet, fleet_toml: Path, enter: Sequence[str] = ()) -> None:
         self.fleet = fleet.name
-        self._heard = fleet.heard
+        self._heard = fleet.listener
         self._log = fleet_toml.with_suffix(".log")
         with self._log.open("ab") as output:
             self.process = subprocess.Popen(
@@ -259,25 +259,25 @@ def test_a_robot_that_starts_later_is_told_origin_fence_and_world(fleet: Fleet) 
         ground.do(SetWorld(world, "changed.env"))
 
         def told(robot: int) -> bool:
-            status = fleet.heard.statuses().get(robot)
+            status = fleet.listener.statuses().get(robot)
             return (
                 status is not None
                 and (status.origin, status.fence, status.world_id)
                 == (ORIGIN, fence, world_id(world))
             )  # fmt: skip
 
-        assert fleet.heard.wait_for(lambda _: told(0) and told(1), PATIENCE_S)
-        before = fleet.heard.history(1)[-1].status.boot_nonce
+        assert fleet.listener.wait_for(lambda _: told(0) and told(1), PATIENCE_S)
+        before = fleet.listener.history(1)[-1].status.boot_nonce
         fleet.robots[1].send_signal(signal.SIGKILL)
         fleet.robots[1].wait(PATIENCE_S)
         fleet.robots[1].start()
 
         def heard_again(_: object) -> bool:
-            return fleet.heard.history(1)[-1].status.boot_nonce != before
+            return fleet.listener.history(1)[-1].status.boot_nonce != before
 
-        assert fleet.heard.wait_for(heard_again, PATIENCE_S)
+        assert fleet.listener.wait_for(heard_again, PATIENCE_S)
         began_s = time.monotonic()
-        assert fleet.heard.wait_for(lambda _: told(1), PATIENCE_S), fleet.heard.statuses()
+        assert fleet.listener.wait_for(lambda _: told(1), PATIENCE_S), fleet.listener.statuses()
         print(f"a robot that starts knows all {time.monotonic() - began_s:.2f} s after its radio")
         ground.do(SetFence(None))
 
@@ -349,7 +349,7 @@ def test_a_ground_that_dies_while_robots_take_off(fleet: Fleet) -> None:
         ground.kill()
         asked.join()
         wait_for_states(fleet, 1, began_s, _S.TAKEOFF, _S.HOLD, _S.LAND, _S.LANDED)
-    waiting = {h.status.state for h in fleet.heard.history(0) if h.at_s >= began_s}
+    waiting = {h.status.state for h in fleet.listener.history(0) if h.at_s >= began_s}
     assert waiting <= {*ON_GROUND}
 
 
@@ -357,13 +357,13 @@ def wait_for_states(fleet: Fleet, robot: int, since_s: float, *states: FlightSta
     """Until a robot has been in all of these, one after another, whoever commands."""
 
     def said() -> list[FlightState]:
-        return [h.status.state for h in fleet.heard.history(robot) if h.at_s >= since_s]
+        return [h.status.state for h in fleet.listener.history(robot) if h.at_s >= since_s]
 
     def been(_: object) -> bool:
         later = iter(said())
         return all(state in later for state in states)
 
-    assert fleet.heard.wait_for(been, PATIENCE_S), said()[-1:]
+    assert fleet.listener.wait_for(been, PATIENCE_S), said()[-1:]
 
 
 def ask_until_it_dies(ground: Ground, request: Request) -> None:

@@ -144,7 +144,7 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
     explored = [0]
     with (
         rig(tmp_path, vehicle) as made, program(made), listening(made, explored),
-        RawGround(made.config.fleet, made.config.link.listen, made.heard) as eve,
+        RawGround(made.config.fleet, made.config.link.listen, made.listener) as eve,
     ):  # fmt: skip
         made.enable()
         tells_where_it_stands(made)
@@ -232,7 +232,7 @@ def says(
     **changes: Any,
 ) -> None:
     """Somebody else takes the command, and wants something else, until it shows."""
-    told = made.ground.told.snapshot.ground
+    told = made.ground.subscriber.snapshot.ground
     assert told is not None
     sequence = max(told.sequence, made.status.obeyed_sequence) + 10
     state = dataclasses.replace(told, sequence=sequence, operator="eve", **changes)

@@ -50,7 +50,7 @@ class FleetRig:
         assert fleet.simulated is not None
         self.fleet = fleet
         self.ground = ground
-        self.listener = fleet.heard
+        self.listener = fleet.listener
         self.simulated = fleet.simulated
 
     # The operator's part
@@ -79,8 +79,8 @@ class FleetRig:
     def assemble(self) -> None:
         """Wait until the ground hears all."""
         self._wait_for_all("assemble", lambda told: True, self.fleet.require_running, 240.0)
-        heard = self.ground.told.wait_for(lambda told: all(r.fresh for r in told.robots), 60.0)
-        assert heard, self.ground.told.snapshot
+        heard = self.ground.subscriber.wait_for(lambda told: all(r.fresh for r in told.robots), 60.0)
+        assert heard, self.ground.subscriber.snapshot
 
     def make_ready(self) -> None:
         """Origin, and their checks, until all are passed."""
@@ -137,7 +137,7 @@ class FleetRig:
 
         until_s = time.monotonic() + at_most_s
         while not self.listener.wait_for(all_are, 0.2):
-            assert time.monotonic() < until_s, (name, self.told(), self.ground.told.snapshot.ground)
+            assert time.monotonic() < until_s, (name, self.told(), self.ground.subscriber.snapshot.ground)
             order()
 
     def told(self) -> dict[int, tuple[str, str, str | None, str]]:

@@ -68,7 +68,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetRig]:
 def attack(rig: FleetRig, session: zenoh.Session, seal: Callable[[Topic, bytes], bytes]) -> None:
     """In the operator's name, and a robot's: states that land all, kills, and false statuses."""
     prefix = f"lpac/{rig.fleet.name}/"
-    state = rig.ground.told.snapshot.ground
+    state = rig.ground.subscriber.snapshot.ground
     assert state is not None
     lands = GroundState(
         **{
@@ -111,7 +111,7 @@ def nothing_comes_of(rig: FleetRig, pytestconfig: pytest.Config) -> Repeated:
             assert vehicle.armed and not vehicle.landed
             assert flies_on(status), (robot, status.state, status.reason)
             assert (status.operator, status.obeyed_sequence) == ("sim", sequence)
-        snapshot = rig.ground.told.snapshot
+        snapshot = rig.ground.subscriber.snapshot
         assert rig.ground.running and snapshot.commander == "sim"
         assert all(robot.fresh and not robot.duplicate for robot in snapshot.robots)
 
@@ -247,7 +247,7 @@ def test_a_landing_and_a_kill_act_after_any_single_forged_message(
                 for robot in ROBOTS:
                     rig.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed)
                 # It hears of it a moment later.
-                assert rig.ground.told.wait_for(
+                assert rig.ground.subscriber.wait_for(
                     lambda told: all(r.status and r.status.armed is False for r in told.robots),
                     60.0,
                 )
@@ -379,7 +379,7 @@ def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FleetRig
     assert flies_on(rig.status(0))
     # Whoever kept the old list says so, and flies on.
     rig.wait_status(STOLEN, lambda status: ReasonCode.MEMBERS_DIFFER in codes(status))
-    assert rig.ground.told.wait_for(
+    assert rig.ground.subscriber.wait_for(
         lambda told: {robot.name for robot in told.robots if robot.fresh} == {"r0"}, 60.0
     )
     rig.command(SafetyCommand("land"))

@@ -158,15 +158,15 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
 ) -> None:
     monkeypatch.setattr("lpac.sim.fleet.processes.STOP_WITHIN_S", 60.0)
     with Fleet(Scenario(robots=2), tmp_path, SHIPPED) as fleet:
-        assert fleet.heard.wait_for(lambda statuses: len(statuses) == 2, 60.0)
-        before = fleet.heard.statuses()[1].boot_nonce
+        assert fleet.listener.wait_for(lambda statuses: len(statuses) == 2, 60.0)
+        before = fleet.listener.statuses()[1].boot_nonce
         fleet.robots[1].send_signal(signal.SIGKILL)
         assert fleet.robots[1].wait(60.0) == -signal.SIGKILL
-        assert fleet.heard.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
+        assert fleet.listener.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
         with pytest.raises(SimulatedFleetError, match="the program of r1 has ended"):
             fleet.require_running()
         fleet.robots[1].start()
-        assert fleet.heard.wait_for(
+        assert fleet.listener.wait_for(
             lambda statuses: 1 in statuses and statuses[1].boot_nonce != before, 60.0
         )
         # A stopped process is woken up to end.
@@ -183,13 +183,13 @@ def test_a_fleet_in_multicast_is_heard_by_each_ground_and_by_itself(tmp_path: Pa
         for robot, endpoint in zip(fleet.robots, fleet.endpoints, strict=True):
             link = load_config(robot.folder / "robot.toml").link
             assert (link.listen, link.connect, link.interface) == ((endpoint,), (), "127.0.0.1")
-        assert fleet.heard.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
+        assert fleet.listener.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
         keys = load_fleet(fleet.fleet_toml).keys
         with FleetListener(fleet=fleet.name, connect=config.connect, identity=keys) as second:
             assert second.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
-        fleet.heard.__exit__(None, None, None)
+        fleet.listener.__exit__(None, None, None)
         gone_unix_s = time.time()
-        assert fleet.heard.wait_for(lambda statuses: not statuses, 60.0)
+        assert fleet.listener.wait_for(lambda statuses: not statuses, 60.0)
     for robot in fleet.robots:
         (log,) = robot.logs()
         assert any(at_s > gone_unix_s for _, at_s, _ in read(log, "received"))

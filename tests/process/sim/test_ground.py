@@ -23,8 +23,8 @@ def test_it_is_a_ground_as_any_other_until_it_ends(tmp_path: Path) -> None:
     fleet = Fleet(Scenario(robots=2), tmp_path, SHIPPED)
     left = socket_path(fleet.name).parent
     with GroundProgram(fleet.fleet_toml, fleet.name) as ground:
-        assert [robot.name for robot in ground.told.snapshot.robots] == ["r0", "r1"]
-        assert ground.told.setup.operator == "sim" and ground.running
+        assert [robot.name for robot in ground.subscriber.snapshot.robots] == ["r0", "r1"]
+        assert ground.subscriber.setup.operator == "sim" and ground.running
         assert problem(ground.command(Enable())) is ProblemCode.NO_ORIGIN
         assert not_done(ground.command(SetOrigin(ORIGIN))) == dict.fromkeys(
             ("r0", "r1"), ResultCode.NOT_HEARD
@@ -47,7 +47,7 @@ def test_a_status_that_is_none_is_said_and_left_out() -> None:
     said: list[str] = []
     with (
         ZenohLink(fleet="test", robot_id=3, listen=(endpoint,)) as robot,
-        FleetListener(fleet="test", connect=(endpoint,), say=said.append) as heard,
+        FleetListener(fleet="test", connect=(endpoint,), report=said.append) as heard,
     ):
 
         def is_said(_: object) -> bool:

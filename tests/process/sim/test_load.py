@@ -35,7 +35,7 @@ def test_a_flight_that_falls_behind_ends_early_and_says_so_first(
 ) -> None:
     said: list[str] = []
     scenario = Scenario(robots=2)
-    fleet = Fleet(scenario, tmp_path, SHIPPED, say=said.append)
+    fleet = Fleet(scenario, tmp_path, SHIPPED, report=said.append)
     assert fleet.simulated is not None
     vehicles = fleet.simulated.vehicles
 
@@ -52,7 +52,7 @@ def test_a_flight_that_falls_behind_ends_early_and_says_so_first(
     monkeypatch.setattr(fleet.simulated, "lost_s", lost_s)
     flight = fly_programs(fleet, said.append)
     # What robots refuse follows from it, and is not said.
-    fleet.say_unless_behind("robot 0 refuses takeoff")
+    fleet.report_unless_behind("robot 0 refuses takeoff")
     problem = flight.script.problem
     assert problem is not None and flight.script.overloaded
     lines = summary_lines(scenario, flight)

@@ -176,14 +176,14 @@ def on_the_simulated_clock(folder: Path, draw: int) -> SeenFlight:
 def as_programs(folder: Path) -> SeenFlight:
     fleet = Fleet(SCENARIO, folder, SHIPPED)
     with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
-        seen = SeenFlight(fleet.layout, ground.told.setup)
+        seen = SeenFlight(fleet.layout, ground.subscriber.setup)
         with watching(fleet.name, seen.snapshots.append):
             flight = ScriptedFlight(
-                ground.told, fleet.fleet_toml, SCENARIO.duration_s,
+                ground.subscriber, fleet.fleet_toml, SCENARIO.duration_s,
                 on_step=lambda step: fleet.begin() if step == "preflight" else None,
             )  # fmt: skip
-            assert ground.told.carry_out(flight.fly()) is None
-            ground.told.carry_out(fresh_snapshot(ground.told))
+            assert ground.subscriber.carry_out(flight.fly()) is None
+            ground.subscriber.carry_out(fresh_snapshot(ground.subscriber))
         seen.behind_s = fleet.lateness().vehicles_s
     seen.commands = flight.commands
     return seen

@@ -648,7 +648,7 @@ def test_a_takeoff_that_fails_brings_all_down_and_is_tried_again(tmp_path: Path)
 
     fleet.schedule.every(0.1, lose_gps_once)
     said: list[str] = []
-    flight = ScriptedFlight(fleet.ground, tmp_path / "fleet.toml", 2.0, say=said.append)
+    flight = ScriptedFlight(fleet.ground, tmp_path / "fleet.toml", 2.0, report=said.append)
     assert fleet.ground.carry_out(flight.fly()) is None
     assert lost and any(text.startswith("all take off again: ") for text in said)
     takeoffs = [done.report.done for done in flight.commands if isinstance(done.request, Takeoff)]
