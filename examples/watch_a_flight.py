@@ -14,7 +14,7 @@ def watch(moment: FlightMoment) -> None:
     speed_m_s = (moment.velocities_m_s**2).sum(axis=1) ** 0.5
     print(
         f"{moment.time_s:4.1f} s  cost {moment.cost / costs[0]:.3f} of the first, "
-        f"speed {speed_m_s.mean():.2f} m/s, {received.min()} to {received.max()} neighbours received"
+        f"speed {speed_m_s.mean():.2f} m/s, {received.min()} to {received.max()} neighbours"
     )
     if moment.cost < 0.6 * costs[0]:
         moment.stop()

@@ -14,7 +14,7 @@ import numpy as np
 from edge.core import F64
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.truth import TrueTrack
-from lpac.ground.procedure import NoSnapshotError, Procedure, carry_out
+from lpac.ground.procedure import NoSnapshotError, Procedure, Until, carry_out
 from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
 from lpac.sim.air import GROUND
 from lpac.sim.drill.faults import FAULTS, Fault
@@ -102,7 +102,10 @@ class SimulatedField(FaultyFleet):
             with suppress(NoSnapshotError):
                 self.ground.command(request)
 
-        return carry_out(procedure, command, lambda until: self.ground.wait(until))
+        def wait(until: Until) -> bool:
+            return self.ground.wait(until)
+
+        return carry_out(procedure, command, wait)
 
     @property
     def vehicles(self) -> Sequence[Px4Vehicle]:

@@ -1,4 +1,4 @@
-"""A fleet of programs in its mission, and what tests order it and ask of it."""
+"""A fleet of programs under a ground, for tests that command it and wait for its statuses."""
 
 import time
 from collections.abc import Callable
@@ -39,7 +39,7 @@ _BY_ITSELF = (
 
 
 def flies_on(status: RobotStatus) -> bool:
-    """Whether it flies its mission, or left it for what it rightly leaves it for."""
+    """Whether the robot flies its mission, or left it for one of the reasons in `_BY_ITSELF`."""
     return status.state is _S.MISSION or status.reason.code in _BY_ITSELF
 
 
@@ -53,21 +53,19 @@ class FleetRig:
         self.listener = fleet.listener
         self.simulated = fleet.simulated
 
-    # The operator's part
-
     @property
     def names(self) -> tuple[str, ...]:
-        """What their operator calls them."""
+        """The robots' names in commands."""
         return tuple(robot.name for robot in self.fleet.robots)
 
     def command(self, request: Request) -> CommandReport:
-        """Command something that is possible as such; not every robot may do it."""
+        """Send a command that the ground accepts; some robots may refuse it."""
         report = self.ground.command(request)
         assert report.problem is None, report
         return report
 
     def done(self, request: Request) -> CommandReport:
-        """Command it until it is done of all, but for what lasts a moment."""
+        """Repeat a command until all robots have done it; refusals must be temporary."""
         until_s = time.monotonic() + 60.0
         while not (report := self.command(request)).done:
             for result in report.results:
@@ -77,23 +75,25 @@ class FleetRig:
         return report
 
     def assemble(self) -> None:
-        """Wait until the ground hears all."""
-        self._wait_for_all("assemble", lambda told: True, self.fleet.require_running, 240.0)
-        heard = self.ground.subscriber.wait_for(lambda told: all(r.fresh for r in told.robots), 60.0)
-        assert heard, self.ground.subscriber.snapshot
+        """Wait until the ground receives all robots."""
+        self._wait_for_all("assemble", lambda status: True, self.fleet.require_running, 240.0)
+        connected = self.ground.subscriber.wait_for(
+            lambda snapshot: all(r.fresh for r in snapshot.robots), 60.0
+        )
+        assert connected, self.ground.subscriber.snapshot
 
     def make_ready(self) -> None:
-        """Origin, and their checks, until all are passed."""
+        """Set the origin, and wait until all robots pass their checks."""
         self.command(SetOrigin(ORIGIN))
         self._wait_for_all(
             "make ready",
-            lambda told: told.state is _S.PREFLIGHT and told.ready,
+            lambda status: status.state is _S.PREFLIGHT and status.ready,
             lambda: self.command(Enable()),
             240.0,
         )
 
     def take_off(self) -> None:
-        """All come to hold at their heights; who was held up on its way lands, and tries again."""
+        """Take off until all hold at their heights; robots that stay too low land and try again."""
 
         def order() -> None:
             statuses = {self.names[r]: s for r, s in self.listener.statuses().items()}
@@ -105,11 +105,14 @@ class FleetRig:
                 self.command(Takeoff(tuple(waiting)))
 
         self._wait_for_all(
-            "take off", lambda told: told.state is _S.HOLD and not is_too_low(told), order, 300.0
+            "take off",
+            lambda status: status.state is _S.HOLD and not is_too_low(status),
+            order,
+            300.0,
         )
 
     def start(self) -> None:
-        """All fly their mission; who left offboard without a pilot is taken back before."""
+        """Start the mission; robots that left offboard without a pilot rejoin first."""
 
         def order() -> None:
             left = [
@@ -121,7 +124,7 @@ class FleetRig:
                 self.command(RobotCommand("rejoin", tuple(left)))
             self.command(Start(self.names))
 
-        self._wait_for_all("start", lambda told: told.state is _S.MISSION, order, 80.0)
+        self._wait_for_all("start", lambda status: status.state is _S.MISSION, order, 80.0)
 
     def _wait_for_all(
         self,
@@ -130,27 +133,31 @@ class FleetRig:
         order: Callable[[], object],
         at_most_s: float,
     ) -> None:
-        """Order it again and again until it holds of all."""
+        """Call `order` until the condition holds for all robots."""
 
         def all_are(statuses: Statuses) -> bool:
             return len(statuses) == len(self.names) and all(map(holds, statuses.values()))
 
         until_s = time.monotonic() + at_most_s
         while not self.listener.wait_for(all_are, 0.2):
-            assert time.monotonic() < until_s, (name, self.told(), self.ground.subscriber.snapshot.ground)
+            assert time.monotonic() < until_s, (
+                name,
+                self.summary(),
+                self.ground.subscriber.snapshot.ground,
+            )
             order()
 
-    def told(self) -> dict[int, tuple[str, str, str | None, str]]:
-        """What the robots say of themselves, for whoever reads a failure."""
+    def summary(self) -> dict[int, tuple[str, str, str | None, str]]:
+        """Last statuses, for the message of a failed assertion."""
         statuses = sorted(self.listener.statuses().items())
         return {r: (s.state, s.reason.text, s.mode, texts(s.failed_checks)) for r, s in statuses}
 
     def status(self, robot: int) -> RobotStatus:
-        """Its newest status."""
+        """The robot's newest status."""
         return self.listener.history(robot)[-1].status
 
     def wait_status(self, robot: int, holds: Callable[[RobotStatus], object]) -> RobotStatus:
-        """Wait for a status of which something holds; returns that one."""
+        """Wait for the first status that meets the condition, and return it."""
         found: list[RobotStatus] = []
 
         def is_found(statuses: Statuses) -> bool:
@@ -158,11 +165,11 @@ class FleetRig:
                 found.append(statuses[robot])
             return bool(found)
 
-        assert self.listener.wait_for(is_found, 60.0), self.told()
+        assert self.listener.wait_for(is_found, 60.0), self.summary()
         return found[0]
 
     def wait_state(self, robot: int, state: FlightState) -> RobotStatus:
-        """Wait until the robot says that it is in this state; returns what it says."""
+        """Wait until the robot is in this state; returns its status."""
         return self.wait_status(robot, lambda status: status.state is state)
 
     # The vehicles' part
@@ -172,8 +179,8 @@ class FleetRig:
         return self.simulated.vehicles[robot]
 
     def wait_vehicle(self, robot: int, holds: Callable[[Px4Vehicle], bool]) -> None:
-        """Wait until something holds of the vehicle."""
+        """Wait until the vehicle meets the condition."""
         vehicle = self.vehicle(robot)
         with self.simulated.stepped:
             found = self.simulated.stepped.wait_for(lambda: holds(vehicle), 120.0)
-        assert found, (robot, self.told(), vehicle.truth[-1])
+        assert found, (robot, self.summary(), vehicle.truth[-1])

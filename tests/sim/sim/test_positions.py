@@ -69,8 +69,12 @@ LASTING = [
         id="no driver",
     ),
     pytest.param(sets(estimate_frozen=True), PositionCause.FROZEN, 1.5, 3.4, id="frozen"),
-    pytest.param(sets(gps_accuracy_override_m=11.0), PositionCause.INACCURATE, 0.8, 2.5, id="hopeless"),
-    pytest.param(sets(gps_accuracy_override_m=6.0), PositionCause.INACCURATE, 0.8, None, id="inaccurate"),
+    pytest.param(
+        sets(gps_accuracy_override_m=11.0), PositionCause.INACCURATE, 0.8, 2.5, id="hopeless"
+    ),
+    pytest.param(
+        sets(gps_accuracy_override_m=6.0), PositionCause.INACCURATE, 0.8, None, id="inaccurate"
+    ),
     pytest.param(jumps(7.0), PositionCause.DISAGREES, 0.8, 2.5, id="jumps"),
     pytest.param(lies(stuck=True), PositionCause.GPS_STUCK, 1.2, 2.8, id="stuck"),
     pytest.param(
