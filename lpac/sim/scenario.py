@@ -77,11 +77,11 @@ class Scenario(Bounded):
 
     controller: Annotated[
         Controller,
-        "What decides where robots fly: lpac, which is the bundle's policy, or a baseline.",
+        "Controller: lpac, which flies the bundle's policy, or a baseline.",
     ] = "lpac"
     robots: Annotated[int, Meta(ge=1, le=MAX_ROBOTS), "Number of robots."] = 10
     seed: Annotated[
-        int, Meta(ge=0), "World, starts, clocks, losses and vehicles' errors follow from it."
+        int, Meta(ge=0), "Seed of world, starts, clocks, losses and vehicles' errors."
     ] = 0
     duration_s: Annotated[
         float, Meta(gt=0.0, le=86_400.0), "Flight time, s; of whole robots that of the mission."
@@ -107,7 +107,7 @@ class Scenario(Bounded):
         AtLeastOne | None, "Side of the world, in model units; else the bundle's."
     ] = None
     communication_range: Annotated[
-        Positive | None, "How far robots are heard, in model units; else the bundle's."
+        Positive | None, "Communication range, in model units; else the bundle's."
     ] = None
     max_speed_m_s: Positive | None = None
     lag_s: Annotated[NonNegative, "Points: time constant by which robots follow a velocity, s."] = (
@@ -116,7 +116,7 @@ class Scenario(Bounded):
     position_bias: tuple[tuple[Finite, Finite], ...] | None = None
     position_error_m: Annotated[
         NonNegative,
-        "Points: how wrong robots are about where they are: standard deviation along each axis, m.",
+        "Points: position error of the robots, standard deviation along each axis, m.",
     ] = 0.0
     failures: tuple[Failure, ...] = ()
     clocks: Clocks = field(default_factory=Clocks)
@@ -133,10 +133,10 @@ class Scenario(Bounded):
     secure: Annotated[
         bool,
         "Whole robots: robots and ground are members of a fleet, with keys that are made for it: "
-        "what they say is signed, and nobody else is heard.",
+        "their messages are signed, and all others are dropped.",
     ] = False
     transport: Transport = "mesh"
-    fault: Annotated[str, "Whole robots: what the drill does to the fleet."] = ""
+    fault: Annotated[str, "Whole robots: a fault of the drill, by name."] = ""
 
     def check_rules(self) -> None:
         """See `Bounded`."""

@@ -26,7 +26,7 @@ class Receiver:
     _stuck_at_m: Vector | None = None
 
     def step(self, dt_s: float, fix_m: Callable[[], Vector], draws: Draws) -> None:
-        """Advance by one step; `fix_m` returns the honest fix."""
+        """Advance by one step; `fix_m` returns the fix without these faults."""
         if not self.stuck:
             self._stuck_at_m = None
         elif self._stuck_at_m is None:

@@ -117,7 +117,7 @@ class Px4Setpoint:
 
 
 class SimulatedSensor(StrEnum):
-    """Sensor that can fail, or with a driver that can."""
+    """Sensor whose hardware or driver can fail."""
 
     GPS = "gps"
     BAROMETER = "barometer"
@@ -125,7 +125,7 @@ class SimulatedSensor(StrEnum):
     BATTERY = "battery"
 
 
-_ALWAYS_THERE = (
+_ALWAYS_PRESENT = (
     Component.BAROMETER, Component.BATTERY, Component.LOCAL_POSITION_ESTIMATE, Component.COMPASS,
     Component.ACCELEROMETER, Component.GYROSCOPE,
 )  # fmt: skip
@@ -326,22 +326,22 @@ class Px4Vehicle:
 
         It has the error of the estimate, which follows it, plus noise, and it is late.
         """
-        return self._world.to_global(self.receiver.place_m(self._honest_fix_m()))
+        return self._world.to_global(self.receiver.place_m(self._faultless_fix_m()))
 
     @property
     def fix_velocity_m_s(self) -> Vector:
         """World frame: the receiver's velocity."""
         return self.receiver.velocity_m_s(self._velocity_m_s)
 
-    def _honest_fix_m(self) -> Vector:
+    def _faultless_fix_m(self) -> Vector:
         noise_m: Sequence[float] = [
             FIX_NOISE_M * math.sin(self.time_s * rate_rad_s) for rate_rad_s in FIX_NOISE_RAD_S
         ]
         if self._errors is not None:
             noise_m = plus(noise_m, self._errors.fix_m(self.time_s))
         late_m = minus(self._position_m, times(self._velocity_m_s, GPS_LAG_S))
-        honest_m = plus(late_m, self._shared_error_m())
-        return total(honest_m, self.gps_jump_m, noise_m)
+        faultless_m = plus(late_m, self._shared_error_m())
+        return total(faultless_m, self.gps_jump_m, noise_m)
 
     def _shared_error_m(self) -> Vector:
         """Error that fix and estimate have in common."""
@@ -592,11 +592,11 @@ class Px4Vehicle:
         draws = self._draws.take(10)
         has_gps = not self.gps_lost and SimulatedSensor.GPS not in self.dead_sensors
         has_gps = has_gps and bool(self.parameters["EKF2_GPS_CTRL"])
-        self.receiver.step(dt_s, self._honest_fix_m, self._draws)
+        self.receiver.step(dt_s, self._faultless_fix_m, self._draws)
         off_m, off_m_s = self.gps_jump_m, ZERO
         if self.receiver.faulty:
-            honest_m = plus(self._position_m, self._shared_error_m())
-            off_m = plus(off_m, self.receiver.off_m(honest_m))
+            faultless_m = plus(self._position_m, self._shared_error_m())
+            off_m = plus(off_m, self.receiver.off_m(faultless_m))
             off_m_s = self.receiver.off_m_s(self._velocity_m_s)
         self.estimator.step(self.time_s, dt_s, has_gps, off_m, off_m_s, draws[:6])
         decay = dt_s / VERTICAL_DRIFT_TIME_S
@@ -628,19 +628,19 @@ class Px4Vehicle:
         parameters = self.parameters
         rc_received, ground_station_lost = self.rc_received, self._ground_station_lost()
         position_valid = self.estimator.position_valid
-        is_there = set(_ALWAYS_THERE)
+        present = set(_ALWAYS_PRESENT)
         if self.estimator.uses_gps:
-            is_there.add(Component.GPS)
+            present.add(Component.GPS)
         if (
             self.armed
             or self._disarmed_at_s is None
             or self.time_s - self._disarmed_at_s < LOG_ENDS_S
         ):
-            is_there.add(Component.LOGGING)
+            present.add(Component.LOGGING)
         if rc_received:
-            is_there.add(Component.REMOTE_CONTROL)
+            present.add(Component.REMOTE_CONTROL)
         if not ground_station_lost:
-            is_there.add(Component.COMMUNICATION_LINKS)
+            present.add(Component.COMMUNICATION_LINKS)
         required = int(parameters["NAV_DLL_ACT"]) > 0
         # In flight the battery warning never decreases.
         self._battery_warning = max(
@@ -673,7 +673,7 @@ class Px4Vehicle:
             ),
         )
         problems: list[ArmingProblem] = [p for is_so, p in found if is_so and p is not None]
-        return HealthReport(tuple(problems), frozenset(is_there))
+        return HealthReport(tuple(problems), frozenset(present))
 
     def _offboard_signal(self) -> bool:
         """Whether setpoints are fresh, and the position to follow them is valid."""
@@ -849,8 +849,8 @@ class Px4Vehicle:
             # Its resistance to wind does not depend on the lag of its commands.
             pushed = times(unmet_m_s, DRAG_PER_S * self._airframe.lag_s / lag_s)
             acceleration = plus(acceleration, pushed)
-        makes_up_m_s = times(unmet_m_s, dt_s / WIND_COMPENSATION_S)
-        self._compensated_wind_m_s = plus(self._compensated_wind_m_s, makes_up_m_s)
+        compensation_m_s = times(unmet_m_s, dt_s / WIND_COMPENSATION_S)
+        self._compensated_wind_m_s = plus(self._compensated_wind_m_s, compensation_m_s)
         self.acceleration_m_s2 = acceleration
         self._velocity_m_s = plus(self._velocity_m_s, times(acceleration, dt_s))
         self._turn(yaw_rad, dt_s)
