@@ -39,7 +39,7 @@ def test_the_table_tells_who_flies_what() -> None:
 def test_hazards_are_shown_by_faults_that_exist() -> None:
     """Of the hazards of docs/risks.md, by their numbers."""
     text = (ROOT / "docs" / "risks.md").read_text()
-    rows = re.findall(r"^\| (\d+) \| .* \| .* \| (.*) \| .* \|$", text, re.MULTILINE)
+    rows = re.findall(r"^\| (\d+)\. .* \| (.*) \| .* \|$", text, re.MULTILINE)
     assert [int(number) for number, _ in rows] == list(range(1, len(rows) + 1))
     named = [name for _, shown in rows for name in re.findall(r"`([a-z0-9-]+)`", shown)]
     assert len(named) > 20 and set(named) <= set(FAULTS)
