@@ -188,5 +188,8 @@ def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
 def test_the_page_has_a_colour_for_every_look() -> None:
     """Of its own it says nothing of a robot."""
     looks = {"ready", "lost", *FlightState}
-    canvas, css = ((PAGE / name).read_text() for name in ("canvas.js", "map.css"))
-    assert all(f'"{look}"' in canvas and f".chip.{look} " in css for look in looks)
+    canvas, css, panel = (
+        (PAGE / name).read_text() for name in ("canvas.js", "map.css", "panel.js")
+    )
+    assert all(f'"{look}"' in canvas and f"--{look}: " in css for look in looks)
+    assert "background = `var(--${robot.look})`" in panel

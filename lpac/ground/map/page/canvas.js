@@ -1,6 +1,6 @@
 // The map: the mission frame in metres, x to the right and y up.
 
-import { colour, direction } from "./dom.js";
+import { circle, colour, direction, trace } from "./dom.js";
 
 const EXPLORED_CELLS = 64;
 // Robots send every 0.4 s, and drop messages older than 0.8 s.
@@ -365,8 +365,7 @@ export class MapCanvas {
   }
 
   polygon(c, corners) {
-    c.beginPath();
-    corners.forEach((corner, n) => c[n ? "lineTo" : "moveTo"](...this.toScreen(corner)));
+    trace(c, corners.map((corner) => this.toScreen(corner)));
     c.closePath();
   }
 
@@ -413,15 +412,12 @@ export class MapCanvas {
       c.fillRect(px - 5, py - 5, 10, 10);
       c.strokeRect(px - 5, py - 5, 10, 10);
       const [x, y] = this.toScreen(robot?.landing_m ?? slot.landing);
-      c.beginPath();
-      c.arc(x, y, 6, 0, 2 * Math.PI);
+      circle(c, x, y, 6);
       c.fill();
       c.stroke();
-      c.beginPath();
-      c.moveTo(x - 3, y - 3);
-      c.lineTo(x + 3, y + 3);
-      c.moveTo(x + 3, y - 3);
-      c.lineTo(x - 3, y + 3);
+      trace(c, [[x - 3, y - 3], [x + 3, y + 3]]);
+      c.stroke();
+      trace(c, [[x + 3, y - 3], [x - 3, y + 3]]);
       c.stroke();
     }
   }
@@ -454,9 +450,7 @@ export class MapCanvas {
     c.setLineDash(heard === undefined ? [2, 5] : n === 2 ? [7, 4] : []);
     c.lineWidth = n === 0 ? 1.5 : 2;
     c.globalAlpha = chosen ? (n === 0 ? 0.6 : 0.95) : 0.12;
-    c.beginPath();
-    c.moveTo(...from);
-    c.lineTo(...to);
+    trace(c, [from, to]);
     c.stroke();
   }
 
@@ -474,8 +468,7 @@ export class MapCanvas {
         const piece = path.slice(n * length, (n + 1) * length + 1);
         if (piece.length < 2) continue;
         c.globalAlpha = (chosen ? 0.95 : 0.75) * ((n + 1) / pieces) ** 1.5;
-        c.beginPath();
-        piece.forEach((point, k) => c[k ? "lineTo" : "moveTo"](...this.toScreen(point)));
+        trace(c, piece.map((point) => this.toScreen(point)));
         c.stroke();
       }
     }
@@ -490,16 +483,13 @@ export class MapCanvas {
     c.lineWidth = 1;
     c.globalAlpha = 0.8;
     c.setLineDash([3, 4]);
-    c.beginPath();
-    c.arc(x, y, this.setup.range_m * this.view.scale, 0, 2 * Math.PI);
+    circle(c, x, y, this.setup.range_m * this.view.scale);
     c.stroke();
     const half = (this.setup.sensor_m / 2) * this.view.scale;
     c.strokeRect(x - half, y - half, 2 * half, 2 * half);
     c.setLineDash([]);
     if (robot.landing_m && this.layers.places) {
-      c.beginPath();
-      c.moveTo(x, y);
-      c.lineTo(...this.toScreen(robot.landing_m));
+      trace(c, [[x, y], this.toScreen(robot.landing_m)]);
       c.stroke();
     }
     c.globalAlpha = 1;
@@ -524,14 +514,13 @@ export class MapCanvas {
       c.fillStyle = style;
       c.lineWidth = width;
       c.lineCap = "butt";
-      c.beginPath();
-      c.moveTo(x + ux * start, y + uy * start);
-      c.lineTo(tip[0] - ux * 5, tip[1] - uy * 5);
+      trace(c, [[x + ux * start, y + uy * start], [tip[0] - ux * 5, tip[1] - uy * 5]]);
       c.stroke();
-      c.beginPath();
-      c.moveTo(...tip);
-      c.lineTo(tip[0] - ux * 9 - uy * 4.5, tip[1] - uy * 9 + ux * 4.5);
-      c.lineTo(tip[0] - ux * 9 + uy * 4.5, tip[1] - uy * 9 - ux * 4.5);
+      trace(c, [
+        tip,
+        [tip[0] - ux * 9 - uy * 4.5, tip[1] - uy * 9 + ux * 4.5],
+        [tip[0] - ux * 9 + uy * 4.5, tip[1] - uy * 9 - ux * 4.5],
+      ]);
       c.closePath();
       if (style === this.ink.halo) c.lineWidth = 2.5;
       if (style === this.ink.halo) c.stroke();
@@ -546,20 +535,15 @@ export class MapCanvas {
     const { look, letter, severity } = robot;
     c.save();
     c.translate(x, y);
-    if (severity === "critical" || severity === "warning") {
-      c.strokeStyle = this.ink[severity === "critical" ? "critical" : "age-1"];
+    const ring = (ink, radius) => {
+      c.strokeStyle = ink;
       c.lineWidth = 3;
-      c.beginPath();
-      c.arc(0, 0, r + 7, 0, 2 * Math.PI);
+      circle(c, 0, 0, radius);
       c.stroke();
-    }
-    if (robot.name === this.selected) {
-      c.strokeStyle = this.ink.accent;
-      c.lineWidth = 3;
-      c.beginPath();
-      c.arc(0, 0, r + 4, 0, 2 * Math.PI);
-      c.stroke();
-    }
+    };
+    if (severity === "critical") ring(this.ink.critical, r + 7);
+    if (severity === "warning") ring(this.ink["age-1"], r + 7);
+    if (robot.name === this.selected) ring(this.ink.accent, r + 4);
     c.lineJoin = "round";
     c.fillStyle = this.ink[look];
     const body = new Path2D();
@@ -611,8 +595,7 @@ export class MapCanvas {
     c.strokeStyle = this.ink.grid;
     c.lineWidth = 1;
     c.globalAlpha = 0.85;
-    c.beginPath();
-    c.arc(0, 0, 26, 0, 2 * Math.PI);
+    circle(c, 0, 0, 26);
     c.fill();
     c.globalAlpha = 1;
     c.stroke();
@@ -621,11 +604,7 @@ export class MapCanvas {
     c.save();
     c.rotate(turn);
     c.fillStyle = this.ink.ink;
-    c.beginPath();
-    c.moveTo(0, -14);
-    c.lineTo(6, 12);
-    c.lineTo(0, 7);
-    c.lineTo(-6, 12);
+    trace(c, [[0, -14], [6, 12], [0, 7], [-6, 12]]);
     c.closePath();
     c.fill();
     c.restore();
@@ -648,11 +627,7 @@ export class MapCanvas {
     for (const [style, width] of [[this.ink.halo, 6], [this.ink.ink, 2]]) {
       c.strokeStyle = style;
       c.lineWidth = width;
-      c.beginPath();
-      c.moveTo(x, y - 5);
-      c.lineTo(x, y);
-      c.lineTo(x + length, y);
-      c.lineTo(x + length, y - 5);
+      trace(c, [[x, y - 5], [x, y], [x + length, y], [x + length, y - 5]]);
       c.stroke();
     }
     c.font = "600 12px system-ui, sans-serif";

@@ -1,7 +1,7 @@
 // Coverage cost of the trial over the mission time, and that of Lloyd's algorithm, which knows the
 // world.
 
-import { clock, colour } from "./dom.js";
+import { circle, clock, colour, trace } from "./dom.js";
 
 const LEFT = 30;
 const RIGHT = 12;
@@ -44,9 +44,7 @@ export class Chart {
     c.textAlign = "right";
     c.textBaseline = "middle";
     for (const share of [0, 0.5, 1]) {
-      c.beginPath();
-      c.moveTo(LEFT, y(share));
-      c.lineTo(w - RIGHT, y(share));
+      trace(c, [[LEFT, y(share)], [w - RIGHT, y(share)]]);
       c.stroke();
       c.fillText(share.toFixed(1), LEFT - 6, y(share));
     }
@@ -60,9 +58,7 @@ export class Chart {
       c.strokeStyle = lloyd;
       c.lineWidth = 2;
       c.setLineDash([6, 4]);
-      c.beginPath();
-      c.moveTo(LEFT, y(this.lloyd));
-      c.lineTo(w - RIGHT, y(this.lloyd));
+      trace(c, [[LEFT, y(this.lloyd)], [w - RIGHT, y(this.lloyd)]]);
       c.stroke();
       c.setLineDash([]);
     }
@@ -75,12 +71,10 @@ export class Chart {
     c.strokeStyle = accent;
     c.lineWidth = 2.25;
     c.lineJoin = "round";
-    c.beginPath();
-    this.points.forEach(([time, share], n) => c[n ? "lineTo" : "moveTo"](x(time), y(share)));
+    trace(c, this.points.map(([time, share]) => [x(time), y(share)]));
     c.stroke();
     c.fillStyle = ink;
-    c.beginPath();
-    c.arc(x(last[0]), y(last[1]), 3.5, 0, 2 * Math.PI);
+    circle(c, x(last[0]), y(last[1]), 3.5);
     c.fill();
   }
 }

@@ -67,3 +67,14 @@ export function clock(seconds) {
   const whole = Math.max(0, Math.floor(seconds));
   return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;
 }
+
+// Begins a path through points on a canvas.
+export function trace(c, points) {
+  c.beginPath();
+  points.forEach(([x, y], n) => c[n ? "lineTo" : "moveTo"](x, y));
+}
+
+export function circle(c, x, y, radius) {
+  c.beginPath();
+  c.arc(x, y, radius, 0, 2 * Math.PI);
+}

@@ -12,6 +12,7 @@ export function chip() {
 export function setChip(element, robot) {
   setClass(element, `chip ${robot.look} ${robot.in_air ? "air" : "ground"}`);
   setText(element, robot.letter);
+  element.style.background = `var(--${robot.look})`;
 }
 
 export function showFleet(robots, selected, onPick) {
