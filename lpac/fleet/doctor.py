@@ -20,7 +20,7 @@ from lpac.fleet.deploy import lpac_inside
 from lpac.fleet.hold import Report, lock, overview, wrong_identity
 from lpac.fleet.operations import Outcome
 from lpac.fleet.program import receive_heartbeat
-from lpac.fleet.session import RemoteError, Session, connect
+from lpac.fleet.session import RemoteError, Session, connect, ssh_options
 from lpac.fleet.settings import FleetConfig, RobotHost
 from lpac.fleet.writer import robot_toml
 
@@ -311,13 +311,8 @@ def on(robot: RobotHost, *commands: str) -> str:
 
 
 def _reach_fix(config: FleetConfig, robot: RobotHost) -> str:
-    ssh = ["ssh"]
-    if config.ssh.config:
-        ssh += ["-F", config.ssh.config]
-    if robot.port is not None:
-        ssh += ["-p", str(robot.port)]
-    ssh.append(f"{robot.user}@{robot.host}")
-    return f"switch {robot.name} on, check its Wi-Fi, then try: {shlex.join(ssh)}"
+    ssh = shlex.join(["ssh", *ssh_options(config, robot), f"{robot.user}@{robot.host}"])
+    return f"switch {robot.name} on, check its Wi-Fi, then try: {ssh}"
 
 
 def _identity(ctx: _Context) -> Finding:

@@ -75,14 +75,16 @@ class RemoteError(FleetError):
 
 def ssh_command(config: FleetConfig, robot: RobotHost) -> list[str]:
     """OpenSSH's command line up to the robot's host."""
-    command = ["ssh", "-o", "BatchMode=yes", "-o", "LogLevel=ERROR", "-T",
-               "-o", f"ConnectTimeout={config.ssh.connect_timeout_s:.0f}",
-               "-o", "ServerAliveInterval=3", "-o", "ServerAliveCountMax=3"]  # fmt: skip
-    if config.ssh.config:
-        command += ["-F", config.ssh.config]
-    if robot.port is not None:
-        command += ["-p", str(robot.port)]
-    return [*command, "-l", robot.user, robot.host]
+    return ["ssh", "-o", "BatchMode=yes", "-o", "LogLevel=ERROR", "-T",
+            "-o", f"ConnectTimeout={config.ssh.connect_timeout_s:.0f}",
+            "-o", "ServerAliveInterval=3", "-o", "ServerAliveCountMax=3",
+            *ssh_options(config, robot), "-l", robot.user, robot.host]  # fmt: skip
+
+
+def ssh_options(config: FleetConfig, robot: RobotHost) -> list[str]:
+    """Options of ssh for the file and the port of fleet.toml."""
+    file = ["-F", config.ssh.config] if config.ssh.config else []
+    return [*file, *(["-p", str(robot.port)] if robot.port is not None else [])]
 
 
 def as_root(command: str) -> str:
@@ -96,9 +98,12 @@ def explain(text: str, host: str) -> str:
     for pattern, advice in _ADVICE:
         if re.search(pattern, text):
             return advice.replace("HOST", host)
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
     # ssh prints nothing when a connection falls silent.
-    return lines[-1] if lines else "it no longer answers: it is off, or out of reach"
+    return _last_line(text) or "it no longer answers: it is off, or out of reach"
+
+
+def _last_line(text: str) -> str:
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
 
 
 class Done(NamedTuple):
@@ -111,8 +116,7 @@ class Done(NamedTuple):
     @property
     def reason(self) -> str:
         """Last line of stderr, else the exit code."""
-        lines = [line.strip() for line in self.err.splitlines() if line.strip()]
-        return lines[-1] if lines else f"exit code {self.code}"
+        return _last_line(self.err) or f"exit code {self.code}"
 
 
 class Session:
