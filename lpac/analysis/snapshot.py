@@ -11,6 +11,8 @@ from edge.messages.mission import GroundState, Place, RobotStatus
 FRESH_S = 2.0
 # A commander that was silent for longer is gone.
 COMMANDER_SILENT_S = 2.0
+# The state while nobody has commanded yet.
+NO_STATE = GroundState(0, "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +108,11 @@ class FleetSnapshot:
     shares_name: bool = False
     members_problem: str = ""
     mission_s: float | None = None
+
+    @property
+    def state(self) -> GroundState:
+        """The commander's state; without one, its defaults."""
+        return self.ground or NO_STATE
 
 
 EventKind = Literal["command", "result", "refusal", "state", "commander", "presence"]

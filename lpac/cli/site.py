@@ -80,7 +80,7 @@ def _as_it_stands(to: Addressed, site: SiteOptions) -> "SavedSite":
         stands = measure(subscriber, sorted(measured), site.seconds)
         return measure_site(
             subscriber.setup,
-            subscriber.snapshot.ground,
+            subscriber.snapshot.state,
             {robot: stands[robot] for robot in names},
             stands.get(site.from_robot),
             stands.get(site.toward),

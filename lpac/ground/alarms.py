@@ -46,7 +46,8 @@ _MIN_RATE_HZ = 1.25
 _MIN_IN_TIME, _MIN_SENT = 0.7, 10
 # Of the wall clock, which stamps the robot's logs.
 _CLOCK_WITHIN_S = 1.0
-_ID = 8
+# Characters shown of an id.
+ID = 8
 _NAMES = 4
 
 
@@ -156,7 +157,7 @@ class _Fleet:
     ) -> None:
         self.setup = setup
         self.snapshot = snapshot
-        self.ground = snapshot.ground
+        self.ground = snapshot.state
         self.ground_before = None if before is None else before.ground
         statuses = {} if before is None else {r.name: r.status for r in before.robots}
         self.seen = [
@@ -165,17 +166,11 @@ class _Fleet:
             if robot.status is not None
         ]
         self.fresh = [seen for seen in self.seen if seen.robot.fresh]
-        self.world = commonest(s.status.world_id for s in self.fresh) or setup.world_id
-        self.origin = commonest(s.status.origin for s in self.fresh)
-        self.fence = setup.fence
-        if self.ground is not None:
-            self.world = self.ground.world_id or self.world
-            self.origin = self.ground.origin or self.origin
-            self.fence = self.ground.fence or self.fence
+        present_world = commonest(s.status.world_id for s in self.fresh)
+        self.world = self.ground.world_id or present_world or setup.world_id
+        self.origin = self.ground.origin or commonest(s.status.origin for s in self.fresh)
+        self.fence = self.ground.fence or setup.fence
         self.blame = blame(self._links())
-
-    def enabled(self, robot: RobotSnapshot) -> bool:
-        return self.ground is not None and self.ground.enabled_for(robot.robot_id)
 
     def _links(self) -> dict[Link, bool]:
         """(sender, receiver) -> whether the link is good, of all pairs that fly within range."""
@@ -227,14 +222,14 @@ def _fleet_alarms(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:
         yield "critical", AlarmCode.NAME_SHARED, text
     if fleet.snapshot.members_problem:
         yield "warning", AlarmCode.MEMBERS_DIFFER, fleet.snapshot.members_problem
-    if ground is not None and ground.safety_action_by not in ("", ground.operator):
+    if ground.safety_action_by not in ("", ground.operator):
         held = [n for n, i in fleet.setup.robots.items() if ground.safety_action_for(i) == "hold"]
         text = f"{ground.safety_action_by} commands {counted(len(held), 'robot')} to hold"
         yield "warning", AlarmCode.HELD_BY_OTHERS, text
     if not fleet.snapshot.commander and not flying:
         yield "note", AlarmCode.NOBODY_COMMANDS, "nobody commands the fleet yet"
     if not fleet.setup.world:
-        text = f"this station lacks the robots' world {fleet.setup.world_id[:_ID]}: no density, no "
+        text = f"this station lacks the robots' world {fleet.setup.world_id[:ID]}: no density, no "
         yield "warning", AlarmCode.WORLD_NOT_HERE, f"{text}cost; `lpac mission world FILE`"
     if fleet.seen:
         slots = {site.robot for site in fleet.setup.slots}
@@ -280,7 +275,7 @@ def _own(fleet: _Fleet, seen: _Seen) -> _Found:
 def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
     """Robot that has had time to obey the ground's earlier state but has not."""
     before, status = fleet.ground_before, seen.status
-    if before is None or fleet.ground is None:
+    if before is None or fleet.snapshot.ground is None:
         return None
     if seen.robot.age_s is None or seen.robot.age_s > _HISTORY_S - _OBEYED_WITHIN_S:
         return None
@@ -309,17 +304,19 @@ def _battery(fleet: _Fleet, seen: _Seen) -> _Found:
 
 
 def _bundle(fleet: _Fleet, seen: _Seen) -> _Found:
-    theirs, ours = seen.status.bundle_id, fleet.setup.bundle_id
-    if theirs == ours:
-        return None
-    return "warning", f"bundle {theirs[:_ID] or 'none'}, not the fleet's {ours[:_ID]}"
+    return _differing("bundle", seen.status.bundle_id, fleet.setup.bundle_id)
 
 
 def _world(fleet: _Fleet, seen: _Seen) -> _Found:
-    theirs, ours = seen.status.world_id, fleet.world
-    if theirs == ours or _reports(seen, WORLD_NOT_TAKEN):
+    if _reports(seen, WORLD_NOT_TAKEN):
         return None
-    return "warning", f"world {theirs[:_ID] or 'none'}, not the fleet's {ours[:_ID]}"
+    return _differing("world", seen.status.world_id, fleet.world)
+
+
+def _differing(what: str, theirs: str, ours: str) -> _Found:
+    if theirs == ours:
+        return None
+    return "warning", f"{what} {theirs[:ID] or 'none'}, not the fleet's {ours[:ID]}"
 
 
 def _origin(fleet: _Fleet, seen: _Seen) -> _Found:
@@ -404,7 +401,7 @@ def _clock(fleet: _Fleet, seen: _Seen) -> _Found:
 def _not_ready(fleet: _Fleet, seen: _Seen) -> _Found:
     status = seen.status
     waits = status.state in (_S.INIT, _S.IDLE, _S.PREFLIGHT) and not status.ready
-    if not waits or not fleet.enabled(seen.robot) or not status.failed_checks:
+    if not waits or not fleet.ground.enabled_for(seen.robot.robot_id) or not status.failed_checks:
         return None
     more = len(status.failed_checks) - 1
     return "note", f"not ready: {status.failed_checks[0].text}{f' (+ {more})' if more else ''}"

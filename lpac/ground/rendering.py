@@ -11,11 +11,12 @@ from typing import Literal, NamedTuple
 from edge.core.counted import counted
 from edge.core.fence import Fence
 from edge.messages.codes import texts
-from edge.messages.mission import ON_GROUND, FlightState, GroundState, RobotStatus
+from edge.messages.mission import ON_GROUND, FlightState, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
 from lpac.ground.alarms import (
     BATTERY_LOW,
     FEATURE_AGE_S,
+    ID,
     LATE_MS,
     LIMITS,
     SEVERITIES,
@@ -28,8 +29,6 @@ TextStyle = Literal[
     "", "strong", "faint", "good", "calm", "busy", "foreign", "critical", "warning", "note", "bar",
     "banner",
 ]  # fmt: skip
-# Characters shown of an id.
-ID = 8
 NOT_HEARD = "not heard"
 
 _S = FlightState
@@ -371,7 +370,7 @@ def facts(row: Row, snapshot: FleetSnapshot, alarms: Iterable[Alarm]) -> list[Fa
     known += [Fact("not taken", each.text, "warning") for each in status.not_taken]
     if status.state in ON_GROUND:
         known += [Fact("not ready", check.text) for check in status.failed_checks]
-    more = _flight(status) | _program(row, status, snapshot.ground)
+    more = _flight(status) | _program(row, status, snapshot)
     return known + [Fact(name, text) for name, text in more.items() if text]
 
 
@@ -408,11 +407,11 @@ def _flight(status: RobotStatus) -> dict[str, str]:
     }
 
 
-def _program(row: Row, status: RobotStatus, ground: GroundState | None) -> dict[str, str]:
+def _program(row: Row, status: RobotStatus, snapshot: FleetSnapshot) -> dict[str, str]:
     x_m, y_m = landing_m = status.landing_point_m
     position_m, origin = status.position_m, status.origin
     away_m = None if position_m is None else math.dist(position_m[:2], landing_m)
-    safety_action = "none" if ground is None else ground.safety_action_for(status.robot_id)
+    safety_action = snapshot.state.safety_action_for(status.robot_id)
     return {
         "landing": f"at x {x_m:.1f} m, y {y_m:.1f} m"
         + _format(", {:.1f} m away", away_m)
@@ -424,7 +423,7 @@ def _program(row: Row, status: RobotStatus, ground: GroundState | None) -> dict[
             status.trial and f"trial {status.trial}",
         ),
         "obeys": f"{status.operator}, state {status.obeyed_sequence}"
-        + ("" if ground is None else f" of {ground.sequence}")
+        + _format(" of {.sequence}", snapshot.ground)
         + ("" if safety_action == "none" else f", asked to {safety_action}")
         if status.operator
         else "nobody yet",

@@ -369,7 +369,7 @@ class ScriptRun:
         report = yield SafetyCommand("hold", self._script.robots)
         done = "hold is commanded"
         if not report.done:
-            done += f", but {failures(report)}"
+            done += f", but {_failures(report)}"
         return f"{done}: next `lpac mission land`, `lpac mission return` or `lpac mission resume`"
 
     def _run_step(self, step: Step, where: str, count: str) -> Procedure[None]:
@@ -408,15 +408,15 @@ class ScriptRun:
             case MissionStep():
                 yield from self._fly_mission(step)
             case ReturnStep():
-                yield from self._land_all(SafetyCommand("return", robots, wait=True))
+                # Not followed by a hold, which would keep landing robots in the air.
+                yield from self._require(SafetyCommand("return", robots, wait=True), hold=False)
             case LandStep():
-                yield from self._land_all(SafetyCommand("land", robots, wait=True))
+                yield from self._require(SafetyCommand("land", robots, wait=True), hold=False)
 
     def _first_number(self) -> int:
         """Number of the first trial: a repeated script continues the numbering."""
-        ground = self._ground.snapshot.ground
         name = re.escape(self._script.trial)
-        match = re.fullmatch(rf"{name}-(\d{{1,6}})", "" if ground is None else ground.trial)
+        match = re.fullmatch(rf"{name}-(\d{{1,6}})", self._ground.snapshot.state.trial)
         return 1 if match is None else int(match[1]) + 1
 
     def _begin_trial(self, number: int, count: str) -> Procedure[None]:
@@ -441,10 +441,8 @@ class ScriptRun:
         yield from self._require(SetOrigin(origin, self._script.robots))
 
     def _prepare(self, step: PreflightStep) -> Procedure[None]:
-        ground, ids = self._ground.snapshot.ground, self._ground.setup.robots
-        if ground and any(
-            ground.safety_action_for(ids[r]) in ("return", "land") for r in self.robots
-        ):
+        state, ids = self._ground.snapshot.state, self._ground.setup.robots
+        if any(state.safety_action_for(ids[r]) in ("return", "land") for r in self.robots):
             # Withdraw the end of the last trial, which keeps robots on the ground.
             yield from self._require(Resume(self._script.robots))
         began_s = self._ground.now_s
@@ -455,7 +453,7 @@ class ScriptRun:
         if report.problem or not all(
             n in statuses and statuses[n].state in _BEFORE_READY for n in not_yet
         ):
-            raise ScriptError(failures(report))
+            raise ScriptError(_failures(report))
 
         def ready(snapshot: FleetSnapshot) -> bool:
             missing = self._not_ready(snapshot)
@@ -475,10 +473,10 @@ class ScriptRun:
     def _not_ready(self, snapshot: FleetSnapshot) -> dict[Hashable, str]:
         """Why robots are not ready, in words; the key identifies each reason."""
         missing: dict[Hashable, str] = {}
-        statuses, ground = self._statuses(snapshot), snapshot.ground
+        statuses = self._statuses(snapshot)
         for name in self.robots:
             status = statuses.get(name)
-            action = ground.safety_action_for(status.robot_id) if ground and status else "none"
+            action = snapshot.state.safety_action_for(status.robot_id) if status else "none"
             if status is None:
                 missing[name, NOT_HEARD] = f"{name} is {NOT_HEARD}"
             elif action != "none":
@@ -491,12 +489,6 @@ class ScriptRun:
                 codes = (check.code for check in status.failed_checks)
                 missing[name, *codes] = f"{name}: {missing_checks(status)}"
         return missing
-
-    def _land_all(self, request: SafetyCommand) -> Procedure[None]:
-        report = yield request
-        if not report.done:
-            # A hold would keep landing robots in the air.
-            raise ScriptError(failures(report), hold=False)
 
     def _fly_mission(self, step: MissionStep) -> Procedure[None]:
         # An older snapshot may show robots before their start.
@@ -541,7 +533,7 @@ class ScriptRun:
         self._last_start_s[name] = self._ground.now_s
         report = yield Start((name,))
         if not report.done:
-            text = f"{name} is not restarted: {failures(report)}"
+            text = f"{name} is not restarted: {_failures(report)}"
             codes = (report.problem and report.problem.code, *map(_codes, report.results))
             self._report_once((name, "not started", codes), text)
 
@@ -580,8 +572,8 @@ class ScriptRun:
             if robot.name in self.robots and robot.status is not None and robot.fresh
         }
 
-    def _require(self, request: Request) -> Procedure[None]:
-        _require((yield request))
+    def _require(self, request: Request, *, hold: bool = True) -> Procedure[None]:
+        _require((yield request), hold=hold)
 
     def _require_of_flying(self, request: Takeoff | Start | RobotCommand) -> Procedure[None]:
         """Give a command in flight. If it fails, another operator's command is reported first."""
@@ -591,7 +583,7 @@ class ScriptRun:
             # On the ground, the last landing's command may still be in force.
             if not all(map(is_down, self._statuses(snapshot).values())):
                 self._check_other_commander(snapshot)
-            raise ScriptError(failures(report))
+            raise ScriptError(_failures(report))
 
     def _report_once(self, what: Hashable, text: str) -> None:
         """Show a text, unless one with the same key was shown, such as with other numbers."""
@@ -633,16 +625,16 @@ def take_site(
     return CommandReport(tuple(results))
 
 
-def _require(report: CommandReport) -> None:
+def _require(report: CommandReport, *, hold: bool = True) -> None:
     if not report.done:
-        raise ScriptError(failures(report))
+        raise ScriptError(_failures(report), hold=hold)
 
 
 def _codes(result: RobotResult) -> tuple[str | None, ...]:
     return result.code, result.refusal
 
 
-def failures(report: CommandReport) -> str:
+def _failures(report: CommandReport) -> str:
     if report.problem is not None:
         return report.problem.text
     return "; ".join(f"{r.robot}: {r.text}" for r in report.results if not r.done)

@@ -360,7 +360,7 @@ def require_apart(slots: Iterable[SiteSlot], errors: ErrorBudget) -> None:
 
 def measure_site(
     setup: FleetSetup,
-    ground: GroundState | None,
+    state: GroundState,
     stands: Mapping[str, Standing],
     first: Standing | None,
     toward: Standing | None,
@@ -373,14 +373,11 @@ def measure_site(
     points are the fleet's; with `land_at_pads`, the pads are the landing points. Raises ValueError
     if there is no origin, a robot has no slot, or the site would not be valid.
     """
-    if first is not None:
-        origin = origin_at(first, toward)
-    elif ground is not None and ground.origin is not None:
-        origin = ground.origin
-    else:
+    origin = state.origin if first is None else origin_at(first, toward)
+    if origin is None:
         raise ValueError("the origin is not set: `lpac mission origin` sets it, or use --from")
     seated = {slot.robot: slot.place for slot in setup.slots if slot.robot}
-    fence = setup.fence if ground is None or ground.fence is None else ground.fence
+    fence = state.fence or setup.fence
     slots = []
     for robot, its in stands.items():
         if robot not in seated:

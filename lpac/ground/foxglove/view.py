@@ -58,6 +58,7 @@ from edge.messages.mission import FlightState, GroundState, RobotStatus, explore
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import (
     FRESH_S,
+    NO_STATE,
     Explored,
     FleetSetup,
     FleetSnapshot,
@@ -142,7 +143,7 @@ class FoxgloveView:
     def __init__(self) -> None:
         self._setup: FleetSetup | None = None
         self._coverage: Coverage | None = None
-        self._state: GroundState | None = None
+        self._state = NO_STATE
         # By name: when it was received, Unix time, and the status.
         self._statuses: dict[str, tuple[float, RobotStatus]] = {}
         self._explored: dict[str, npt.NDArray[np.bool_]] = {}
@@ -243,15 +244,13 @@ class FoxgloveView:
         )
 
     def _fence(self, setup: FleetSetup, unix_time_s: float) -> SceneUpdate:
-        commanded = self._state.fence if self._state is not None else None
-        fence = setup.fence if commanded is None else commanded
+        fence = self._state.fence or setup.fence
         return SceneUpdate(entities=[_outline("fence", fence.vertices_m, _RED, unix_time_s)])
 
     def _fleet(self, setup: FleetSetup, unix_now_s: float) -> ShownFleet:
-        state = self._state
         return ShownFleet(
-            trial="" if state is None else state.trial,
-            safety_action="none" if state is None else state.safety_action,
+            trial=self._state.trial,
+            safety_action=self._state.safety_action,
             seen_share=float(np.mean(self._seen() > 0)),
             robots=tuple(map(_shown_row, self._rows(setup, unix_now_s))),
         )
@@ -264,8 +263,7 @@ class FoxgloveView:
             for name, robot_id in setup.robots.items()
             for received_s, status in (self._statuses.get(name, (None, None)),)
         )
-        commander = "" if self._state is None else self._state.operator
-        snapshot = FleetSnapshot(unix_now_s, commander, self._state, tuple(robots))
+        snapshot = FleetSnapshot(unix_now_s, self._state.operator, self._state, tuple(robots))
         return rows(setup, snapshot, alarms(setup, snapshot))
 
     def _seen(self) -> npt.NDArray[np.uint8]:

@@ -67,40 +67,38 @@ def setup_view(setup: FleetSetup, coverage: Coverage | None) -> Json:
 
 def snapshot_view(setup: FleetSetup, snapshot: FleetSnapshot, alarms: tuple[Alarm, ...]) -> Json:
     """Present state of the fleet."""
-    ground = snapshot.ground
-    fence = ground.fence if ground is not None and ground.fence is not None else setup.fence
-    heading_deg = None if ground is None or ground.origin is None else ground.origin.heading_deg
+    state = snapshot.state
+    fence, origin = state.fence or setup.fence, state.origin
+    heading_deg = None if origin is None else origin.heading_deg
     index = {robot.robot_id: n for n, robot in enumerate(snapshot.robots)}
     return {
         "kind": "snapshot",
         "unix_time_s": snapshot.unix_time_s,
         "commander": snapshot.commander,
         "own": snapshot.commander == setup.operator,
-        "trial": "" if ground is None else ground.trial,
-        "safety_action": "none" if ground is None else ground.safety_action,
-        "safety_action_by": "" if ground is None else ground.safety_action_by or ground.operator,
+        "trial": state.trial,
+        "safety_action": state.safety_action,
+        "safety_action_by": state.safety_action_by or state.operator,
         "heading_deg": heading_deg,
-        "origin": None
-        if ground is None or ground.origin is None
-        else [ground.origin.latitude_deg, ground.origin.longitude_deg],
+        "origin": origin and [origin.latitude_deg, origin.longitude_deg],
         "fence": [_rounded(corner) for corner in fence.vertices_m],
         "buffer": [_rounded(corner) for corner in fence.grown_m(-fence.buffer_m)],
         "running": list(snapshot.running),
         "alarms": [alarm._asdict() for alarm in alarms],
         "robots": [
-            _robot_view(row, ground, heading_deg, index) for row in rows(setup, snapshot, alarms)
+            _robot_view(row, state, heading_deg, index) for row in rows(setup, snapshot, alarms)
         ],
     }
 
 
 def _robot_view(
-    row: Row, ground: GroundState | None, heading_deg: float | None, index: dict[int, int]
+    row: Row, state: GroundState, heading_deg: float | None, index: dict[int, int]
 ) -> Json:
     robot, status = row.robot, row.robot.status
     view: Json = {
         "name": robot.name,
         "fresh": robot.fresh,
-        "enabled": ground is not None and ground.enabled_for(robot.robot_id),
+        "enabled": state.enabled_for(robot.robot_id),
         "word": cell(row, "state").text,
         "look": _LOST,
         "letter": "?",

@@ -9,8 +9,15 @@ from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from typing import Any
 
 from edge.messages.codes import FENCE_NOT_TAKEN, ReasonCode, Refusal, RefusalCode, texts
-from edge.messages.mission import AT_SLOT_M, FlightState, OrderKind, RobotStatus, world_id
-from lpac.analysis.snapshot import COMMANDER_SILENT_S
+from edge.messages.mission import (
+    AT_SLOT_M,
+    FlightState,
+    GroundState,
+    OrderKind,
+    RobotStatus,
+    world_id,
+)
+from lpac.analysis.snapshot import COMMANDER_SILENT_S, NO_STATE
 from lpac.ground.rendering import NOT_HEARD, missing_checks, state_and_reason
 from lpac.ground.station.protocol import (
     CommandProgress,
@@ -216,6 +223,10 @@ class CommandTask:
     def _end(self) -> None:
         self.report = CommandReport(tuple(self._results[name] for name in self.names))
 
+    @property
+    def _state(self) -> GroundState:
+        return self._station.state or NO_STATE
+
     def _status(self, name: str) -> RobotStatus | None:
         return self._station.recent_status(name)
 
@@ -341,9 +352,9 @@ class CommandTask:
                 return None
             return f"slot {place.slot}, {height_m:g} m high"
 
-        before = {} if self._station.state is None else self._station.state.places
         taken = {place.slot for place in places.values()}
-        others = {robot: place for robot, place in before.items() if place.slot not in taken}
+        before = self._state.places.items()
+        others = {robot: place for robot, place in before if place.slot not in taken}
         given = {str(robot): place for robot, place in places.items()}
         sequence = self._station.change(places=others | given)
         yield from self._await_effect(sequence, effect)
@@ -357,8 +368,7 @@ class CommandTask:
                 raise _ProblemError(ProblemCode.SLOT_SHARED, text)
 
     def _refuse_without_origin(self, _: Enable | Takeoff) -> None:
-        state = self._station.state
-        if self.name != "disable" and (state is None or state.origin is None):
+        if self.name != "disable" and self._state.origin is None:
             text = "no mission origin: set it with `lpac mission origin`"
             raise _ProblemError(ProblemCode.NO_ORIGIN, text)
 
@@ -367,9 +377,8 @@ class CommandTask:
         if self._addressed_ids is None:
             sequence = station.change(enabled=request.on, robot_enabled={})
         else:
-            before = {} if station.state is None else station.state.robot_enabled
             these = dict.fromkeys(map(str, self._addressed_ids), request.on)
-            sequence = station.change(robot_enabled=before | these)
+            sequence = station.change(robot_enabled=self._state.robot_enabled | these)
 
         def on(status: RobotStatus) -> str | None:
             if status.state in (_S.INIT, _S.IDLE, *_NOT_CONTROLLED):
@@ -455,9 +464,7 @@ class CommandTask:
 
     def _under_safety_action(self) -> dict[str, str]:
         """Open robots that are commanded to hold, return or land, with the reason in words."""
-        state, robots = self._station.state, self._station.setup.robots
-        if state is None:
-            return {}
+        state, robots = self._state, self._station.setup.robots
         by = f" by {state.safety_action_by}" if state.safety_action_by else ""
         return {
             name: f"{safety_action} is commanded{by}: `lpac mission resume` withdraws it"
@@ -472,8 +479,7 @@ class CommandTask:
 
     def _check_takeoff(self, request: Takeoff) -> None:
         self._refuse_without_origin(request)
-        state = self._station.state
-        if state is not None and not any(map(state.enabled_for, self._ids())):
+        if not any(map(self._state.enabled_for, self._ids())):
             raise _ProblemError(ProblemCode.NOT_ENABLED, _NOT_ENABLED)
         if not self._all_down(self.names):
             self._refuse_under_safety_action(request)
@@ -484,10 +490,10 @@ class CommandTask:
         An addressed or flying robot that is not heard may be in the air.
         """
         station = self._station
-        state, robots = station.state, station.setup.robots
+        robots = station.setup.robots
         expected = {*self.names, *station.flying}
-        return state is not None and all(
-            state.safety_action_for(robots[name]) != "hold"
+        return all(
+            self._state.safety_action_for(robots[name]) != "hold"
             and (name not in expected if (s := self._status(name)) is None else is_down(s))
             for name in names
         )
@@ -506,7 +512,9 @@ class CommandTask:
         ordered_s: dict[str, float] = {}
         ready_by_s, next_s = station.now_s + _READY_S, station.now_s
         while self._open:
-            self._check_climbs(ordered_s)
+            for name in self._open:
+                if name in ordered_s:
+                    self._check_climb(name, ordered_s[name])
             failed = [result.robot for result in self._results.values() if not result.done]
             if failed and request.abort_on_failure:
                 self._fail(waiting, _C.NOT_ORDERED, f"not ordered: {failed[0]} failed")
@@ -516,12 +524,13 @@ class CommandTask:
                 # A silent robot may come back, and then runs its checks again.
                 ready_by_s = station.now_s + _READY_S
             if waiting and station.now_s >= next_s:
-                ordered = self._order_takeoff(waiting[-1], late=station.now_s >= ready_by_s)
-                if ordered is not None:
-                    name = waiting.pop()
-                    if ordered:
-                        ordered_s[name] = station.now_s
-                        next_s = station.now_s + request.interval_s
+                name = waiting[-1]
+                self._order_takeoff(name, late=station.now_s >= ready_by_s)
+                if name in self._orders:
+                    ordered_s[name] = station.now_s
+                    next_s = station.now_s + request.interval_s
+                if name in self._orders or name not in self._open:
+                    waiting.pop()
             if self._open:
                 yield
 
@@ -529,42 +538,28 @@ class CommandTask:
         for name, status in self._open_statuses().items():
             if status.state in (_S.HOLD, _S.MISSION):
                 self._settle_climb(name, status, f"already in the air, in {status.state}")
-            elif not self._is_enabled(name):
+            elif not self._state.enabled_for(status.robot_id):
                 self._fail([name], _C.NOT_ENABLED, _NOT_ENABLED)
             elif status.state in _NOT_CONTROLLED:
                 self._fail([name], *_explain(status))
             elif not status.ready:
                 self._report_progress(name, _explain(status)[1])
 
-    def _is_enabled(self, name: str) -> bool:
-        state = self._station.state
-        return state is not None and state.enabled_for(self._station.setup.robots[name])
-
     def _height_m(self, name: str) -> float:
         status = self._status(name)
         return 0.0 if status is None else status.slot_height_m
 
-    def _order_takeoff(self, name: str, *, late: bool) -> bool | None:
-        """Order takeoff if the robot is ready. True: ordered, False: failed, None: wait."""
+    def _order_takeoff(self, name: str, *, late: bool) -> None:
+        """Order takeoff once the robot is ready; if it is `late`, it fails instead."""
         status = self._status(name)
         if status is None:
             self._fail([name], *_NOT_HEARD)
-        elif self._station.status(name) is None:
-            return None
-        elif status.state is _S.PREFLIGHT and status.ready:
-            self._order("takeoff", name)
-            self._report_progress(name, "taking off")
-            return True
-        elif late:
-            self._fail([name], *_explain(status))
-        else:
-            return None
-        return False
-
-    def _check_climbs(self, ordered_s: Mapping[str, float]) -> None:
-        for name, at_s in ordered_s.items():
-            if name in self._open:
-                self._check_climb(name, at_s)
+        elif self._station.status(name) is not None:
+            if status.state is _S.PREFLIGHT and status.ready:
+                self._order("takeoff", name)
+                self._report_progress(name, "taking off")
+            elif late:
+                self._fail([name], *_explain(status))
 
     def _check_climb(self, name: str, ordered_s: float) -> None:
         """Record the result of a takeoff that is over."""
@@ -592,8 +587,7 @@ class CommandTask:
         for name, why in self._under_safety_action().items():
             self._fail([name], _C.UNDER_SAFETY_ACTION, why)
         yield from self._reach_robots()
-        state = self._station.state
-        trial = state.trial if state is not None and state.trial else next_trial("")
+        trial = self._state.trial or next_trial("")
         self._station.change(trial=trial)
         yield from self._order_start(trial)
 
@@ -635,8 +629,7 @@ class CommandTask:
         yield from self._reach_robots()
         yield from self._stop_returning()
         yield from self._await_obedience(station.safety_action("none", self._addressed_ids))
-        assert station.state is not None
-        trial = station.state.trial
+        trial = self._state.trial
         for name, status in self._open_statuses().items():
             if is_down(status):
                 self._settle(name, "on the ground")
@@ -662,11 +655,7 @@ class CommandTask:
                 yield
         except GeneratorExit:
             # Abandoned: continue the return, unless another station has commanded hold since.
-            if (
-                station.commands
-                and station.state is not None
-                and not station.state.safety_action_by
-            ):
+            if station.commands and not self._state.safety_action_by:
                 station.safety_action("return", ids)
             raise
 
@@ -692,8 +681,7 @@ class CommandTask:
 
     def _next_trial(self, request: NextTrial) -> Steps:
         yield from self._reach_robots()
-        state = self._station.state
-        trial = request.trial or next_trial("" if state is None else state.trial)
+        trial = request.trial or next_trial(self._state.trial)
         self._station.change(trial=trial)
         for name in self._open:
             self._order("reset", name, trial)
@@ -701,18 +689,11 @@ class CommandTask:
 
     def _take_command(self, _: TakeCommand) -> Steps:
         station = self._station
-        until_s = station.now_s + _OBEY_S
         station.election.take_command()
-
-        def check(name: str, status: RobotStatus) -> None:
+        for _step in self._await_effect(0, lambda _: f"obeys {station.operator}"):
+            yield
             # Again: another station may change its state at the same moment.
             station.election.take_command()
-            if self._obeys(status):
-                self._settle(name, f"obeys {station.operator}")
-            elif station.now_s > until_s:
-                self._fail([name], *self._disobedience(status))
-
-        yield from self._for_each_robot(check)
 
 
 # The robot's program does not control the vehicle in these.

@@ -256,7 +256,9 @@ class Watch(App[str]):
         banner.display = bool(self._problem) and lost_s > _CONNECT_AGAIN_S
         if banner.display:
             banner.show(connection_lost(self._setup, self._problem, lost_s, width))
-        self._show("message", [line(width, Span(" "), self._bottom())])
+        question = self._question
+        prompt = question and Span(f"{question.text}  y: yes, any other key: no ", "banner")
+        self._show("message", [line(width, Span(" "), prompt or self._message)])
         self._show("keys", [line(width, *KEYS)])
         setup, snapshot = self._setup, self._snapshot
         if setup is None or snapshot is None:
@@ -304,9 +306,6 @@ class Watch(App[str]):
 
     def _show(self, name: str, lines: Sequence[Line], selected: int | None = None) -> None:
         self.query_one(f"#{name}", Lines).show(lines, selected)
-
-    def _bottom(self) -> Span:
-        return self._message if self._question is None else _prompt(self._question)
 
     def action_help_quit(self) -> None:
         """Quit on Ctrl-C."""
@@ -374,7 +373,3 @@ class Watch(App[str]):
             result = Span(f"{word} NOT SENT: {error}", "critical")
         self._message = Span(f"{time.strftime('%H:%M:%S')} {result.text}", result.style)
         self._draw()
-
-
-def _prompt(question: _Question) -> Span:
-    return Span(f"{question.text}  y: yes, any other key: no ", "banner")

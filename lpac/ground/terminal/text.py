@@ -5,8 +5,8 @@ from itertools import accumulate
 
 from edge.messages.mission import GroundState
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
-from lpac.ground.alarms import Alarm, Severity
-from lpac.ground.rendering import ID, MARKS, Span, direction, duration, fence_size, in_order
+from lpac.ground.alarms import ID, Alarm, Severity
+from lpac.ground.rendering import MARKS, Span, direction, duration, fence_size, in_order
 from lpac.ground.station.protocol import CommandReport
 from lpac.ground.terminal.lines import Line, fit, line, plain, some, wrapped
 from lpac.ground.terminal.robots import columns, heading, table_row
@@ -50,20 +50,21 @@ HELP = (
 
 def header(setup: FleetSetup, snapshot: FleetSnapshot, width: int) -> list[Line]:
     """Three lines about the fleet."""
-    ground, mission_s = snapshot.ground, snapshot.mission_s
+    state, mission_s = snapshot.state, snapshot.mission_s
     clock = "" if mission_s is None else f"mission {duration(mission_s)}"
     who = _commander(setup, snapshot)
-    trial = "" if ground is None or not ground.trial else f"trial {ground.trial}"
+    trial = state.trial and f"trial {state.trial}"
+    running = ", ".join(snapshot.running)
     first = _spaced(Span(setup.fleet, "strong"), who, Span(trial))
     return [
         (*line(width - len(clock) - 1, *first), Span(" " + clock, "strong")),
         line(
             width,
             *_spaced(
-                _enabled(ground),
-                _safety_action(setup, ground),
-                *_running(snapshot),
-                _fence(setup, ground),
+                _enabled(state),
+                _safety_action(setup, state) if snapshot.ground else Span(""),
+                Span(running and f"now: {running}", "busy"),
+                Span(f"fence {fence_size(state.fence or setup.fence)}"),
             ),
         ),
         line(width, *_spaced(*_field(setup, snapshot))),
@@ -82,40 +83,31 @@ def _commander(setup: FleetSetup, snapshot: FleetSnapshot) -> Span:
     return Span(f"{snapshot.commander} commands, {setup.operator} observes", "foreign")
 
 
-def _enabled(ground: GroundState | None) -> Span:
-    if ground is None:
-        return Span("not enabled")
-    others = sum(enabled != ground.enabled for enabled in ground.robot_enabled.values())
+def _enabled(state: GroundState) -> Span:
+    others = sum(enabled != state.enabled for enabled in state.robot_enabled.values())
     but = f" but {others}" if others else ""
-    return Span(f"ENABLED{but}", "busy") if ground.enabled else Span(f"not enabled{but}")
+    return Span(f"ENABLED{but}", "busy") if state.enabled else Span(f"not enabled{but}")
 
 
-def _safety_action(setup: FleetSetup, ground: GroundState | None) -> Span:
-    if ground is None:
-        return Span("")
+def _safety_action(setup: FleetSetup, state: GroundState) -> Span:
     names = {str(robot_id): name for name, robot_id in setup.robots.items()}
-    asked = [] if ground.safety_action == "none" else [ground.safety_action.upper()]
+    asked = [] if state.safety_action == "none" else [state.safety_action.upper()]
     for safety_action in ("hold", "return", "land", "none"):
         who = [
             names.get(r, r)
-            for r, c in ground.robot_safety_actions.items()
-            if c == safety_action != ground.safety_action
+            for r, c in state.robot_safety_actions.items()
+            if c == safety_action != state.safety_action
         ]
         if who:
             asked.append(
                 f"{'FLY' if safety_action == 'none' else safety_action.upper()} {some(who, 16)}"
             )
-    by = ground.safety_action_by or ground.operator
+    by = state.safety_action_by or state.operator
     return Span(f"{', '.join(asked)} by {by}", "calm") if asked else Span("no hold")
 
 
-def _running(snapshot: FleetSnapshot) -> list[Span]:
-    return [Span(f"now: {', '.join(snapshot.running)}", "busy")] if snapshot.running else []
-
-
 def _field(setup: FleetSetup, snapshot: FleetSnapshot) -> Iterable[Span]:
-    ground = snapshot.ground
-    origin = None if ground is None else ground.origin
+    origin = snapshot.state.origin
     if origin is None:
         yield Span("no origin", "warning")
     else:
@@ -124,13 +116,8 @@ def _field(setup: FleetSetup, snapshot: FleetSnapshot) -> Iterable[Span]:
             f"{direction(origin.heading_deg)}"
         )
     yield Span(f"bundle {setup.bundle_id[:ID]}")
-    world = setup.world_id if ground is None or ground.world_id is None else ground.world_id
+    world = snapshot.state.world_id or setup.world_id
     yield Span(f"world {world[:ID]}")
-
-
-def _fence(setup: FleetSetup, ground: GroundState | None) -> Span:
-    asked = None if ground is None else ground.fence
-    return Span(f"fence {fence_size(asked or setup.fence)}")
 
 
 def alarm_lines(alarms: Sequence[Alarm], width: int) -> list[Line]:
