@@ -369,7 +369,7 @@ class ScriptRun:
         report = yield SafetyCommand("hold", self._script.robots)
         done = "hold is commanded"
         if not report.done:
-            done += f", but {_failures(report)}"
+            done += f", but {failures(report)}"
         return f"{done}: next `lpac mission land`, `lpac mission return` or `lpac mission resume`"
 
     def _run_step(self, step: Step, where: str, count: str) -> Procedure[None]:
@@ -453,7 +453,7 @@ class ScriptRun:
         if report.problem or not all(
             n in statuses and statuses[n].state in _BEFORE_READY for n in not_yet
         ):
-            raise ScriptError(_failures(report))
+            raise ScriptError(failures(report))
 
         def ready(snapshot: FleetSnapshot) -> bool:
             missing = self._not_ready(snapshot)
@@ -533,7 +533,7 @@ class ScriptRun:
         self._last_start_s[name] = self._ground.now_s
         report = yield Start((name,))
         if not report.done:
-            text = f"{name} is not restarted: {_failures(report)}"
+            text = f"{name} is not restarted: {failures(report)}"
             codes = (report.problem and report.problem.code, *map(_codes, report.results))
             self._report_once((name, "not started", codes), text)
 
@@ -583,7 +583,7 @@ class ScriptRun:
             # On the ground, the last landing's command may still be in force.
             if not all(map(is_down, self._statuses(snapshot).values())):
                 self._check_other_commander(snapshot)
-            raise ScriptError(_failures(report))
+            raise ScriptError(failures(report))
 
     def _report_once(self, what: Hashable, text: str) -> None:
         """Show a text, unless one with the same key was shown, such as with other numbers."""
@@ -627,14 +627,15 @@ def take_site(
 
 def _require(report: CommandReport, *, hold: bool = True) -> None:
     if not report.done:
-        raise ScriptError(_failures(report), hold=hold)
+        raise ScriptError(failures(report), hold=hold)
 
 
 def _codes(result: RobotResult) -> tuple[str | None, ...]:
     return result.code, result.refusal
 
 
-def _failures(report: CommandReport) -> str:
+def failures(report: CommandReport) -> str:
+    """Describe why a command was not done."""
     if report.problem is not None:
         return report.problem.text
     return "; ".join(f"{r.robot}: {r.text}" for r in report.results if not r.done)

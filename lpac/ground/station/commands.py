@@ -5,7 +5,7 @@ whenever it has to wait for messages or time.
 """
 
 import math
-from collections.abc import Callable, Collection, Generator, Iterable, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable
 from typing import Any
 
 from edge.messages.codes import FENCE_NOT_TAKEN, ReasonCode, Refusal, RefusalCode, texts

@@ -11,6 +11,7 @@ from edge.messages.mission import FlightState, Origin, RobotStatus
 from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
 from lpac.ground.procedure import Procedure, Until, collect_statuses
 from lpac.ground.script import (
+    LandStep,
     MissionStep,
     OriginStep,
     Perturbation,
@@ -247,7 +248,7 @@ def test_nothing_of_a_trial_is_left_for_the_next(run: tuple[Told, Heard, ScriptR
     result_of(rejoining, CommandReport())
     assert script.piloted == set() and heard.lines[-1] == "r1 is back in the mission"
 
-    landing = script._land_all(SafetyCommand("land", wait=True))
+    landing = script._execute(LandStep())
     next(landing)
     with pytest.raises(ScriptError) as failed:
         landing.send(CommandReport((RobotResult("r1", ResultCode.NOT_HEARD, "not heard"),)))
