@@ -304,19 +304,17 @@ def _battery(fleet: _Fleet, seen: _Seen) -> _Found:
 
 
 def _bundle(fleet: _Fleet, seen: _Seen) -> _Found:
-    return _differing("bundle", seen.status.bundle_id, fleet.setup.bundle_id)
+    theirs, ours = seen.status.bundle_id, fleet.setup.bundle_id
+    if theirs == ours:
+        return None
+    return "warning", f"bundle {theirs[:ID] or 'none'}, not the fleet's {ours[:ID]}"
 
 
 def _world(fleet: _Fleet, seen: _Seen) -> _Found:
-    if _reports(seen, WORLD_NOT_TAKEN):
+    theirs, ours = seen.status.world_id, fleet.world
+    if theirs == ours or _reports(seen, WORLD_NOT_TAKEN):
         return None
-    return _differing("world", seen.status.world_id, fleet.world)
-
-
-def _differing(what: str, theirs: str, ours: str) -> _Found:
-    if theirs == ours:
-        return None
-    return "warning", f"{what} {theirs[:ID] or 'none'}, not the fleet's {ours[:ID]}"
+    return "warning", f"world {theirs[:ID] or 'none'}, not the fleet's {ours[:ID]}"
 
 
 def _origin(fleet: _Fleet, seen: _Seen) -> _Found:
