@@ -12,6 +12,7 @@ from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
 from edge.core.part import PartError
 from edge.core.ports import Odometry
+from edge.core.shared_map import SharedMap
 from edge.core.wire import encode
 from edge.policy.family import Policy
 from edge.robot.config import Rates
@@ -108,6 +109,9 @@ class _Flight:
         self._offsets = distances[:, None] * np.stack([np.cos(angles_rad), np.sin(angles_rad)], 1)
         size = policy.message_size
         self._payloads = self._rng.random((neighbours, size), np.float32)
+        side = perception.shared_map_side
+        codes = self._rng.integers(1, 200, (side, side), np.uint8)
+        self._shared = SharedMap((0, 0), codes) if side else None
 
     def view(self, position: F64) -> F32:
         """See `Sensor`."""
@@ -146,7 +150,7 @@ class _Flight:
                 robot_id=number,
                 position_m=(x + offset[0], y + offset[1], height),
             )
-            data = encode(AggregatedMessage(payload), "float16")
+            data = encode(AggregatedMessage(payload, shared=self._shared), "float16")
             self._pac.receive(beacon, (1, self._ticks), data, now_s)
 
 
