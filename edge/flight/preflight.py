@@ -24,6 +24,7 @@ from edge.messages.beacon import Beacon, Neighbour, ReceivedBeacon, tag
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 
+_C = CheckCode
 _FIX_3D = 3
 
 
@@ -110,29 +111,29 @@ def failed_checks(inputs: PreflightInputs, limits: PreflightLimits) -> tuple[Fai
 def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
     if inputs.bundle_problem is not None:
         yield FailedCheck(
-            CheckCode.BUNDLE_NOT_VERIFIED,
+            _C.BUNDLE_NOT_VERIFIED,
             f"bundle is not verified ({inputs.bundle_problem}): deploy it again",
         )
     age_s = inputs.ground_age_s
     if age_s is None:
         yield FailedCheck(
-            CheckCode.GROUND_NOT_HEARD,
+            _C.GROUND_NOT_HEARD,
             "ground was not heard: start `lpac ground`, check the radio and the fleet's name",
         )
     elif not age_s <= limits.max_ground_age_s:
         yield FailedCheck(
-            CheckCode.GROUND_SILENT, f"ground was last heard {age_s:.1f} s ago: check the radio"
+            _C.GROUND_SILENT, f"ground was last heard {age_s:.1f} s ago: check the radio"
         )
     error_s = inputs.time_uncertainty_s
     if age_s is not None and not (error_s is not None and error_s <= limits.max_time_uncertainty_s):
         known = "not known yet" if error_s is None else f"known to {error_s:.1f} s only"
         text = f"the ground's time is {known}: wait, or check the radio"
-        yield FailedCheck(CheckCode.TIME_NOT_KNOWN, text, True)
+        yield _settles(_C.TIME_NOT_KNOWN, text)
     # Without a position there is nothing to perceive.
     if inputs.position_m is not None and not inputs.has_answer:
         why = inputs.answer_problem or "wait; if this stays, this robot's log says why"
         text = f"the policy has no fresh answer: {why}"
-        yield FailedCheck(CheckCode.NO_FRESH_ANSWER, text, not inputs.answer_problem)
+        yield FailedCheck(_C.NO_FRESH_ANSWER, text, not inputs.answer_problem)
 
 
 def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
@@ -142,42 +143,42 @@ def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[Faile
         others = ", ".join(map(str, vehicle.other_system_ids))
         if others:
             yield FailedCheck(
-                CheckCode.OTHER_AUTOPILOT,
+                _C.OTHER_AUTOPILOT,
                 f"autopilot with system id {inputs.system_id} is not connected, but system id "
                 f"{others} is: set MAV_SYS_ID or the config",
             )
         else:
             yield FailedCheck(
-                CheckCode.AUTOPILOT_NOT_CONNECTED,
+                _C.AUTOPILOT_NOT_CONNECTED,
                 "autopilot is not connected: check its power and the connection's address",
             )
         return
     if vehicle.system_id != inputs.system_id:
         yield FailedCheck(
-            CheckCode.SYSTEM_ID_WRONG,
+            _C.SYSTEM_ID_WRONG,
             f"autopilot has system id {_or_unknown(vehicle.system_id)}, configured is "
             f"{inputs.system_id}: check which vehicle this is, set MAV_SYS_ID or the config",
         )
     if is_too_old(vehicle.version):
         oldest = ".".join(map(str, OLDEST))
         yield FailedCheck(
-            CheckCode.PX4_TOO_OLD,
+            _C.PX4_TOO_OLD,
             f"autopilot has PX4 {vehicle.version}, must have {oldest} or newer: update it",
         )
     if vehicle.other_system_ids:
         others = ", ".join(map(str, vehicle.other_system_ids))
         yield FailedCheck(
-            CheckCode.OTHER_VEHICLES,
+            _C.OTHER_VEHICLES,
             f"other vehicles are on this link (system id {others}): give each its own port",
         )
     if inputs.rc == "pilot" and not vehicle.remote_control:
         yield FailedCheck(
-            CheckCode.REMOTE_CONTROL_NOT_HEARD,
+            _C.REMOTE_CONTROL_NOT_HEARD,
             "remote control is not heard, and the config has a pilot: switch it on",
         )
     if vehicle.armed is not False:
         state = "armed" if vehicle.armed else "not known to be disarmed"
-        yield FailedCheck(CheckCode.NOT_DISARMED, f"vehicle is {state}: disarm it")
+        yield FailedCheck(_C.NOT_DISARMED, f"vehicle is {state}: disarm it")
     yield from _estimate(vehicle, inputs, limits)
     yield from _gps(vehicle.gps, limits)
     yield from _battery(vehicle.battery, limits)
@@ -186,12 +187,10 @@ def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[Faile
 
 def _battery(battery: float | None, limits: PreflightLimits) -> Iterator[FailedCheck]:
     if battery is None:
-        yield FailedCheck(
-            CheckCode.BATTERY_NOT_KNOWN, "battery is not known: check the power module"
-        )
+        yield FailedCheck(_C.BATTERY_NOT_KNOWN, "battery is not known: check the power module")
     elif not battery >= limits.min_battery:
         yield FailedCheck(
-            CheckCode.BATTERY_LOW,
+            _C.BATTERY_LOW,
             f"battery has {100.0 * battery:.0f} %, must have "
             f"{100.0 * limits.min_battery:.0f} %: charge or change it",
         )
@@ -202,26 +201,24 @@ def _arming(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     if not vehicle.armable:
         reasons = "; ".join(problem.text for problem in vehicle.problems) or "it does not say why"
         yield FailedCheck(
-            CheckCode.NOT_ARMABLE, f"autopilot would not arm ({reasons}): mend what it names"
+            _C.NOT_ARMABLE, f"autopilot would not arm ({reasons}): mend what it names"
         )
     if inputs.failsafe_problems is None:
-        yield FailedCheck(
-            CheckCode.FAILSAFE_NOT_READ,
+        yield _settles(
+            _C.FAILSAFE_NOT_READ,
             "autopilot's failsafe parameters were not read: wait, or check the link",
-            settles_by_itself=True,
         )
     else:
         for problem in inputs.failsafe_problems:
-            yield FailedCheck(CheckCode.FAILSAFE_WRONG, f"autopilot's {problem}")
+            yield FailedCheck(_C.FAILSAFE_WRONG, f"autopilot's {problem}")
     # Without a mission origin there is no fence to upload; that is a check of its own.
     if inputs.fence_changed or not (inputs.fence_uploaded or inputs.origin is None):
-        yield FailedCheck(
-            CheckCode.FENCE_NOT_UPLOADED,
+        yield _settles(
+            _C.FENCE_NOT_UPLOADED,
             "somebody else changed or cleared the autopilot's fence: find out who, and wait until "
             "it is uploaded again"
             if inputs.fence_changed
             else "autopilot does not have the fence: wait for the upload, or check the link",
-            settles_by_itself=True,
         )
 
 
@@ -230,72 +227,54 @@ def _estimate(
 ) -> Iterator[FailedCheck]:
     age_s = inputs.now_s - vehicle.position_at_s
     if vehicle.position_local_m is None:
-        yield FailedCheck(
-            CheckCode.POSITION_NOT_KNOWN,
-            "position is not known: wait for the autopilot's estimate",
-            settles_by_itself=True,
+        yield _settles(
+            _C.POSITION_NOT_KNOWN, "position is not known: wait for the autopilot's estimate"
         )
     elif not age_s <= limits.max_position_age_s:
         yield FailedCheck(
-            CheckCode.POSITION_OLD,
-            f"position is {age_s:.1f} s old: check the link to the autopilot",
+            _C.POSITION_OLD, f"position is {age_s:.1f} s old: check the link to the autopilot"
         )
     elif inputs.position.quality is not PositionQuality.GOOD:
-        yield FailedCheck(
-            CheckCode.POSITION_NOT_GOOD,
+        yield _settles(
+            _C.POSITION_NOT_GOOD,
             f"position is {inputs.position.quality} ({inputs.position.text}): wait, or move to "
             "open sky",
-            settles_by_itself=True,
         )
     if vehicle.origin is None:
-        yield FailedCheck(
-            CheckCode.ESTIMATOR_ORIGIN_NOT_KNOWN,
-            "estimator's origin is not known: wait for a GPS fix",
-            settles_by_itself=True,
+        yield _settles(
+            _C.ESTIMATOR_ORIGIN_NOT_KNOWN, "estimator's origin is not known: wait for a GPS fix"
         )
     if vehicle.heading_rad is None:
-        yield FailedCheck(
-            CheckCode.HEADING_NOT_KNOWN,
-            "heading is not known: check the compass",
-            settles_by_itself=True,
-        )
+        yield _settles(_C.HEADING_NOT_KNOWN, "heading is not known: check the compass")
 
 
 def _gps(gps: Gps | None, limits: PreflightLimits) -> Iterator[FailedCheck]:
     if gps is None:
-        yield FailedCheck(CheckCode.GPS_NOT_HEARD, "GPS is not heard: check the receiver")
+        yield FailedCheck(_C.GPS_NOT_HEARD, "GPS is not heard: check the receiver")
         return
     if gps.fix < _FIX_3D:
-        yield FailedCheck(
-            CheckCode.GPS_NO_FIX,
-            "GPS has no 3-D fix: wait, or move to open sky",
-            settles_by_itself=True,
-        )
+        yield _settles(_C.GPS_NO_FIX, "GPS has no 3-D fix: wait, or move to open sky")
     if gps.satellites < limits.min_satellites:
-        yield FailedCheck(
-            CheckCode.GPS_FEW_SATELLITES,
+        yield _settles(
+            _C.GPS_FEW_SATELLITES,
             f"GPS sees {counted(gps.satellites, 'satellite')}, must see {limits.min_satellites}: "
             "wait, or move to open sky",
-            settles_by_itself=True,
         )
     if not gps.hdop <= limits.max_hdop:
-        yield FailedCheck(
-            CheckCode.GPS_IMPRECISE,
+        yield _settles(
+            _C.GPS_IMPRECISE,
             f"GPS precision (HDOP) is {gps.hdop:.1f}, must be at most {limits.max_hdop:g}: "
             "wait, or move to open sky",
-            settles_by_itself=True,
         )
 
 
 def _place(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     fence = inputs.fence
     if inputs.origin is None:
-        yield FailedCheck(
-            CheckCode.ORIGIN_NOT_SET, "mission origin is not set: set it on the ground"
-        )
+        yield FailedCheck(_C.ORIGIN_NOT_SET, "mission origin is not set: set it on the ground")
     if inputs.position_m is None:
         yield FailedCheck(
-            CheckCode.PLACE_NOT_KNOWN,
+            _C.PLACE_NOT_KNOWN,
             "place in the fence is not known: it needs the position and the mission origin",
         )
     else:
@@ -303,7 +282,7 @@ def _place(inputs: PreflightInputs) -> Iterator[FailedCheck]:
         depth_m = fence.distance_m(x_m, y_m)
         if not depth_m >= fence.buffer_m:
             yield FailedCheck(
-                CheckCode.STANDS_OUTSIDE,
+                _C.STANDS_OUTSIDE,
                 f"robot stands {_where(depth_m)}, must be {fence.buffer_m:g} m inside: "
                 "carry it there, or check the mission origin",
             )
@@ -315,13 +294,13 @@ def _place(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     depth_m = fence.distance_m(*inputs.landing_point_m)
     if not depth_m >= fence.buffer_m:
         yield FailedCheck(
-            CheckCode.LANDS_OUTSIDE,
+            _C.LANDS_OUTSIDE,
             f"landing point lies {_where(depth_m)}, must be {fence.buffer_m:g} m inside: "
             "change it in the config, or on the ground",
         )
     if not fence.floor_m <= inputs.slot_height_m <= fence.ceiling_m:
         yield FailedCheck(
-            CheckCode.HEIGHT_OUTSIDE,
+            _C.HEIGHT_OUTSIDE,
             f"slot height is {inputs.slot_height_m:g} m, must be from the floor at "
             f"{fence.floor_m:g} m to the ceiling at {fence.ceiling_m:g} m: "
             "change it in the config, or on the ground",
@@ -332,7 +311,7 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
     others = [each.beacon for each in inputs.neighbours]
     if inputs.duplicate_id:
         yield FailedCheck(
-            CheckCode.DUPLICATE_ID,
+            _C.DUPLICATE_ID,
             f"another program uses the id of robot {inputs.robot_id}: stop it, or change its id",
         )
     releases = [(f"robot {beacon.robot_id}", beacon.other_release) for beacon in others]
@@ -340,12 +319,12 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
     for who, release in (*releases, ("the ground", inputs.ground_release), *unreadable):
         if release:
             yield FailedCheck(
-                CheckCode.OTHER_RELEASE,
+                _C.OTHER_RELEASE,
                 f"{who} flies another release ({release}) than this robot: deploy one to all",
             )
     for robot_id in inputs.missing_robots:
         yield FailedCheck(
-            CheckCode.OTHER_NOT_HEARD,
+            _C.OTHER_NOT_HEARD,
             f"the ground hears robot {robot_id}, and this robot does not: they would not keep "
             "apart; `lpac fleet radio` tells who hears whom",
         )
@@ -355,22 +334,19 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
         other = f"robot {beacon.robot_id}"
         if beacon.system_id is not None and beacon.system_id == inputs.system_id:
             yield FailedCheck(
-                CheckCode.SAME_SYSTEM_ID,
+                _C.SAME_SYSTEM_ID,
                 f"{other}'s vehicle has the same system id {beacon.system_id}: set MAV_SYS_ID",
             )
         if beacon.bundle_tag != bundle_tag:
-            yield FailedCheck(
-                CheckCode.OTHER_BUNDLE, f"{other} has another bundle: deploy one to all"
-            )
+            yield FailedCheck(_C.OTHER_BUNDLE, f"{other} has another bundle: deploy one to all")
         if beacon.world_tag != world_tag:
             yield FailedCheck(
-                CheckCode.OTHER_WORLD,
+                _C.OTHER_WORLD,
                 f"{other} has another world: set one on the ground, or deploy it to all",
             )
         if frame_id is not None and beacon.frame_id != frame_id:
             yield FailedCheck(
-                CheckCode.OTHER_ORIGIN,
-                f"{other} has another mission origin: set it again on the ground",
+                _C.OTHER_ORIGIN, f"{other} has another mission origin: set it again on the ground"
             )
         yield from _apart(inputs, beacon, other)
     yield from _in_the_way(inputs, others)
@@ -389,11 +365,10 @@ def _may_come_down(inputs: PreflightInputs) -> Iterator[FailedCheck]:
         apart_m = float(np.hypot(*(near_m - place_m)))
         least_m = inputs.separation.landed_m + deviation_m(silent, limits)
         if apart_m < least_m and highest_possible_m(silent, limits) > 0.0:
-            yield FailedCheck(
-                CheckCode.SILENT_NEAR,
+            yield _settles(
+                _C.SILENT_NEAR,
                 f"robot {silent.robot_id} fell silent in flight, and may come down here: wait "
                 "until it is heard or surely down",
-                True,
             )
 
 
@@ -411,7 +386,7 @@ def _too_late(errors: ErrorBudget, others: Sequence[Beacon]) -> Iterator[FailedC
         )
         # A text that stays the same.
         yield FailedCheck(
-            CheckCode.TAKEOFFS_TOO_FAR_APART,
+            _C.TAKEOFFS_TOO_FAR_APART,
             f"robot {robot_id} has been in the air {since}: heights have walked since then; wait "
             "until all are down, or raise takeoffs_height_m of [errors]",
         )
@@ -425,7 +400,7 @@ def _in_the_way(inputs: PreflightInputs, others: Sequence[Beacon]) -> Iterator[F
     for other, _ in in_the_way((x_m, y_m), standing, inputs.errors):
         least_m = places_apart(inputs.errors.position_m, inputs.errors.position_m).least_m
         yield FailedCheck(
-            CheckCode.LANDING_POINT_TAKEN,
+            _C.LANDING_POINT_TAKEN,
             f"robot {other.robot_id} stands less than {least_m:.3g} m from this robot's landing "
             "point, or comes down there, and not at its own: carry it there, or change the places "
             "on the ground",
@@ -440,7 +415,7 @@ def _apart(inputs: PreflightInputs, beacon: Beacon, other: str) -> Iterator[Fail
     apart_m = abs(beacon.slot_height_m - inputs.slot_height_m)
     if not heights.holds(apart_m):
         yield FailedCheck(
-            CheckCode.HEIGHTS_TOO_NEAR,
+            _C.HEIGHTS_TOO_NEAR,
             f"{other} flies {apart_m:.1f} m above or below, {heights}: "
             "change the slots in the config, or on the ground",
         )
@@ -453,10 +428,14 @@ def _apart(inputs: PreflightInputs, beacon: Beacon, other: str) -> Iterator[Fail
         planned = places_apart(errors.position_m, errors.position_m)
         why = "too near for the GPS accuracy that is reported; " if planned.holds(apart_m) else ""
         yield FailedCheck(
-            CheckCode.LANDINGS_TOO_NEAR,
+            _C.LANDINGS_TOO_NEAR,
             f"{other} lands {apart_m:.1f} m away, {places}: "
             f"{why}change the landing points in the config, or on the ground",
         )
+
+
+def _settles(code: CheckCode, text: str) -> FailedCheck:
+    return FailedCheck(code, text, settles_by_itself=True)
 
 
 def _where(depth_m: float) -> str:
