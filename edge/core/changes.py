@@ -35,6 +35,12 @@ def plain(value: object) -> Any:
     return msgspec.to_builtins(value, enc_hook=_listed)
 
 
+def fields_of(value: object) -> dict[str, Any]:
+    """Fields of a dataclass or struct by name, unconverted."""
+    names, values, _, _ = _kind(type(value))
+    return dict(zip(names, values(value), strict=True))
+
+
 def changes(before: object, after: object) -> dict[str, Any]:
     """Fields of the dataclass or struct `after` that differ from `before`; name -> plain value.
 

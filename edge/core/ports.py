@@ -58,8 +58,7 @@ class Camera(Protocol):
         """
 
 
-# Makes a sensor from the text of a world file and the file's name for a ValueError. A sensor of the
-# real world needs neither.
+# See `SensorDriver`.
 SensorOver = Callable[[str, str], Sensor | Camera]
 
 

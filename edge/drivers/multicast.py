@@ -18,13 +18,7 @@ from edge.core.logger import log
 from edge.core.wire import MAX_ROBOT_ID
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID, ZenohLink
 from edge.identity.envelope import read_head
-from edge.identity.group import (
-    Assembly,
-    Fragment,
-    GroupKey,
-    datagrams,
-    open_datagram,
-)
+from edge.identity.group import Assembly, Fragment, GroupKey, datagrams, open_datagram
 from edge.identity.replay_window import NO_NUMBER
 from edge.messages.admission import Admission
 from edge.messages.topics import MESSAGE, Group, GroupKeys, ReceiveCallback, Topic

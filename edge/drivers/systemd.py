@@ -68,11 +68,7 @@ def status_text(
         "system_id": status.system_id,
         "autopilot": autopilot,
         "loops": {
-            name: {
-                "ticks": loop.ticks,
-                "failures": loop.failures,
-                "age_s": _rounded(ages_s[name]),
-            }
+            name: {"ticks": loop.ticks, "failures": loop.failures, "age_s": _rounded(ages_s[name])}
             for name, loop in status.loops.items()
         },
         "peers": peers,

@@ -43,21 +43,9 @@ _OFFBOARD_LOSS = {
     6: _STOP_MOTORS,
     7: _STOP_MOTORS,
 }
-_LINK_LOSS = {
-    0: "do nothing",
-    1: "hold",
-    2: _RETURN,
-    3: _LAND,
-    5: _STOP_MOTORS,
-    6: _STOP_MOTORS,
-}
+_LINK_LOSS = {0: "do nothing", 1: "hold", 2: _RETURN, 3: _LAND, 5: _STOP_MOTORS, 6: _STOP_MOTORS}
 _FENCE = {0: "do nothing", 1: "warn", 2: "hold", 3: _RETURN, 4: _STOP_MOTORS, 5: _LAND}
-_BATTERY = {
-    0: "warn, and fly until it falls",
-    1: _RETURN,
-    2: _LAND,
-    3: _RETURN_AND_LAND,
-}
+_BATTERY = {0: "warn, and fly until it falls", 1: _RETURN, 2: _LAND, 3: _RETURN_AND_LAND}
 _REMOTE_CONTROL = {
     0: "only a remote control's sticks count",
     1: "only a ground station's sticks count",

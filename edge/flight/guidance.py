@@ -80,11 +80,7 @@ class Guidance:
 
 
 def guide(
-    robot: Robot,
-    flight: FlightMemory,
-    inputs: FlightInputs,
-    guidance: Guidance,
-    dt_s: float,
+    robot: Robot, flight: FlightMemory, inputs: FlightInputs, guidance: Guidance, dt_s: float
 ) -> tuple[MissionSetpoint | None, Guidance]:
     """This tick's setpoint, None to send nothing, and the memory for the next tick.
 

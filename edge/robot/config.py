@@ -23,14 +23,7 @@ from edge.core.address import (
 from edge.core.fence import Fence
 from edge.core.frames import ModelScale
 from edge.core.position import PositionLimits
-from edge.core.schema import (
-    MAX_FLOAT,
-    Bounded,
-    ConfigError,
-    NonNegative,
-    Positive,
-    from_mapping,
-)
+from edge.core.schema import MAX_FLOAT, Bounded, ConfigError, NonNegative, Positive, from_mapping
 from edge.core.toml import read_toml
 from edge.core.wire import PAYLOAD_TYPES, PayloadType
 from edge.flight.energy import EnergyParameters

@@ -30,14 +30,7 @@ from edge.flight.state import (
 from edge.flight.step import step
 from edge.messages.beacon import Beacon, Neighbour, ReceivedBeacon
 from edge.messages.codes import CheckCode, FailedCheck, Reason
-from edge.messages.mission import (
-    AIRBORNE,
-    ON_GROUND,
-    STEERED,
-    FlightState,
-    GroundState,
-    Origin,
-)
+from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState, Origin
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation
 from edge.robot.neighbours import BEACON_LASTS_S

@@ -9,14 +9,7 @@ from edge.core import F64
 from edge.core.frames import LocalTransform, MissionFrame, m_per_deg
 from edge.core.ports import Odometry, Vehicle
 from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
-from edge.core.vehicle import (
-    GlobalOrigin,
-    Position,
-    Setpoint,
-    Vector,
-    VehicleState,
-    Velocity,
-)
+from edge.core.vehicle import GlobalOrigin, Position, Setpoint, Vector, VehicleState, Velocity
 from edge.flight.guidance import MissionPosition, MissionSetpoint
 
 # A dozen missing positions at 20 Hz.

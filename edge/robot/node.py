@@ -6,12 +6,13 @@ It has no clock, thread or socket of its own. On a drone, threads call the steps
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from operator import attrgetter
+from collections.abc import Callable, Mapping
+from functools import partial
 
+from edge.core.changes import fields_of
 from edge.core.logger import log
 from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
-from edge.core.vehicle import Action, VehicleState
+from edge.core.vehicle import Action
 from edge.flight.state import flown_s, in_air
 from edge.identity.guard import Guard, Sender
 from edge.messages.beacon import BEACON_BYTES, decode_beacon, encode_beacon, tag
@@ -47,7 +48,7 @@ from edge.robot.control import FlightControl, GroundWorld
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation
 from edge.robot.neighbours import BEACON_LASTS_S
-from edge.robot.pac import Pac, PolicyTick
+from edge.robot.pac import Pac
 from edge.robot.readiness import Readiness
 
 _EXPLORED_PERIOD_S = 1.0
@@ -62,15 +63,6 @@ _RADIO_COUNTS_PERIOD_S = 1.9
 _SILENT_TICKS, _SILENT_S = 1.5, 1.0
 # States in which it commands the vehicle, and may restore its settings.
 _STEERS = (FlightState.ARMING, *AIRBORNE)
-# Fields of messages that are logged whole.
-_FIELDS: dict[type, tuple[str, ...]] = {
-    VehicleState: VehicleState.__struct_fields__,
-    **{
-        kind: tuple(field.name for field in dataclasses.fields(kind))
-        for kind in (RobotStatus, PolicyTick)
-    },
-}
-_VALUES = {kind: attrgetter(*names) for kind, names in _FIELDS.items()}
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
 
 
@@ -164,9 +156,9 @@ class RobotNode:
         return self._guard.subscriptions(
             {
                 MESSAGE: self._receive_message,
-                STATE: self._receive_state,
-                HOLD: self._receive_hold,
-                ORDER: self._receive_order,
+                STATE: partial(self._receive_now, self._inbox.receive_ground),
+                HOLD: partial(self._receive_now, self._inbox.receive_hold),
+                ORDER: partial(self._receive_now, self._inbox.receive_order),
                 WORLD: self._receive_world,
             }
         )
@@ -175,14 +167,10 @@ class RobotNode:
         """Publish on this link from now on."""
         self._link = self._guard.wrap(link)
 
-    def _receive_state(self, _: str, data: bytes, sender: Sender) -> None:
-        self._inbox.receive_ground(data, sender, self._ports.clock.monotonic_s())
-
-    def _receive_hold(self, _: str, data: bytes, sender: Sender) -> None:
-        self._inbox.receive_hold(data, sender, self._ports.clock.monotonic_s())
-
-    def _receive_order(self, _: str, data: bytes, sender: Sender) -> None:
-        self._inbox.receive_order(data, sender, self._ports.clock.monotonic_s())
+    def _receive_now(
+        self, receive: Callable[[bytes, Sender, float], None], _: str, data: bytes, sender: Sender
+    ) -> None:
+        receive(data, sender, self._ports.clock.monotonic_s())
 
     def _receive_world(self, _: str, data: bytes, __: Sender) -> None:
         self._inbox.world = data
@@ -232,9 +220,7 @@ class RobotNode:
             self._publish(EXPLORED, explored_to_bytes(self._pac.explored()))
         if tick is not None:
             self._ports.recorder.record(
-                "perception",
-                self._ports.clock.unix_s(),
-                {**tick.inputs, "features": tick.features},
+                "perception", self._ports.clock.unix_s(), {**tick.inputs, "features": tick.features}
             )
 
     def policy_step(self) -> None:
@@ -244,7 +230,7 @@ class RobotNode:
         if tick is None:
             return
         self._publish_message(tick.message)
-        self._ports.recorder.record("policy", self._ports.clock.unix_s(), _fields(tick))
+        self._ports.recorder.record("policy", self._ports.clock.unix_s(), fields_of(tick))
 
     def _warn_once(self, problem: str) -> None:
         if problem and problem not in self._warned:
@@ -369,8 +355,8 @@ class RobotNode:
             # The policy is silent or hangs: neighbours must not lose this robot's position.
             self._publish_message()
         vehicle = self._ports.vehicle.state()
-        self._ports.recorder.record("status", unix_now_s, _fields(status))
-        self._ports.recorder.record("vehicle", unix_now_s, _fields(vehicle))
+        self._ports.recorder.record("status", unix_now_s, fields_of(status))
+        self._ports.recorder.record("vehicle", unix_now_s, fields_of(vehicle))
         if status.position_m is not None:
             yaw_rad = status.heading_rad
             if yaw_rad is not None and status.origin is not None:
@@ -527,11 +513,6 @@ class RobotNode:
         is_claimed = self._link is not None and self._link.is_claimed(robot_id)
         is_received = self._pac.table.is_own_id_received(self._ports.clock.monotonic_s())
         return is_claimed or is_received or robot_id in self._guard.duplicate_robots()
-
-
-def _fields(value: RobotStatus | VehicleState | PolicyTick) -> dict[str, object]:
-    kind = type(value)
-    return dict(zip(_FIELDS[kind], _VALUES[kind](value), strict=True))
 
 
 def _urgent_values(status: RobotStatus) -> tuple[object, ...]:

@@ -26,13 +26,7 @@ from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Camera, Odometry, OdometrySource, Sensor
 from edge.core.schema import Bounded, NonNegative, Positive, require
 from edge.core.shared_map import SharedMap
-from edge.core.wire import (
-    PayloadType,
-    Rejection,
-    decode,
-    encode,
-    most_bytes,
-)
+from edge.core.wire import PayloadType, Rejection, decode, encode, most_bytes
 from edge.flight.safety import limit_speed
 from edge.identity.envelope import OVERHEAD_BYTES
 from edge.messages.beacon import BEACON_BYTES, Beacon, tag

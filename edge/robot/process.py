@@ -27,12 +27,7 @@ from edge.core.vehicle import Action, Setpoint
 from edge.drivers.clock import SystemClock
 from edge.drivers.door import DoorStatus, allow_most_descriptors, descriptors_short
 from edge.drivers.flight_log import FlightLog
-from edge.drivers.identity_folder import (
-    GROUP_KEYS,
-    Identity,
-    load_identity,
-    receiving_identity,
-)
+from edge.drivers.identity_folder import GROUP_KEYS, Identity, load_identity, receiving_identity
 from edge.drivers.logs import log_to
 from edge.drivers.process_lock import ProcessLock
 from edge.drivers.registry import load_verified_policy, open_link, open_sensor, open_vehicle

@@ -66,11 +66,7 @@ _COMMANDS = {
         frozenset({Action.ARM, Action.OFFBOARD, Action.LAND}),
     ),
     Action.LAND: _Command(
-        _NAV_LAND,
-        (),
-        3,
-        0.5,
-        frozenset({Action.ARM, Action.OFFBOARD, Action.HOLD}),
+        _NAV_LAND, (), 3, 0.5, frozenset({Action.ARM, Action.OFFBOARD, Action.HOLD})
     ),
     Action.DISARM: _Command(_ARM_DISARM, (0.0,), 3, 0.5, frozenset({Action.ARM, Action.OFFBOARD})),
     # Sent all five times: an answer may belong to an ARM that it overtook.

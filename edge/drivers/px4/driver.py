@@ -24,8 +24,5 @@ def px4_vehicle(setting: VehicleSetting) -> Iterator[OpenVehicle]:
     """
     no_options("autopilot", setting.options)
     port = int(setting.url.rpartition(":")[2])
-    with (
-        vehicle_lock(port),
-        MavsdkAutopilot(setting.url, system_id=setting.system_id) as autopilot,
-    ):
+    with vehicle_lock(port), MavsdkAutopilot(setting.url, system_id=setting.system_id) as autopilot:
         yield OpenVehicle(autopilot, autopilot, partial(WatchdogProcess, port, setting.system_id))
