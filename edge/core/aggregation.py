@@ -40,7 +40,7 @@ class Geometry(Bounded):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AggregatedMessage:
-    """A robot's policy's message to its neighbours: Y_j.
+    """Message of a robot's policy to its neighbours: Y_j.
 
     `payload` (message_size,) is float32 or float16: (y_j)_kl in the order [l][k][feature], times
     1/sqrt(d_j), where d_j is the sender's number of neighbours. `shared` is the sender's map of its

@@ -58,7 +58,7 @@ class FleetClock:
     ) -> None:
         """Update from a state that the ground `base` sent at `time_s` of its clock.
 
-        The ground had received this robot's message of `echoed_at_s` at `held_s` before that.
+        The ground had received this robot's message, sent at `echoed_at_s`, `held_s` earlier.
         """
         round_trip_s = now_s - echoed_at_s - held_s
         if not (round_trip_s >= -_ROUNDED_S and held_s >= 0.0 and math.isfinite(time_s)):

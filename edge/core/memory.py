@@ -94,8 +94,8 @@ class RobotMemory:
     def observe(self, position: F64, view: F32, seen: Bools | None = None) -> None:
         """Write the sensor's view (sensor_size, sensor_size) around `position` into the map.
 
-        With `seen`, of the same shape, only where it is True. Cells of `explored` count as seen
-        with their centre.
+        With `seen`, of the same shape, only where it is True. A cell of `explored` counts as seen
+        if its centre was.
         """
         size = view.shape[0]
         corner = window_corner(position, size)

@@ -63,7 +63,7 @@ SensorOver = Callable[[str, str], Sensor | Camera]
 
 
 class SensorSetting(NamedTuple):
-    """Requirements of a sensor: views of `perception.sensor_size`, as in the policy's training.
+    """Settings of a sensor: its views are of `perception.sensor_size`, as in training.
 
     `idf_truncation` (standard deviations) and `idf_norm` (the largest importance) are those of a
     computed world. `options` are the sensor's in robot.toml.
@@ -79,9 +79,9 @@ class SensorDriver(Protocol):
     """Type of sensor. Its context is closed when the robot's program ends."""
 
     def __call__(self, setting: SensorSetting) -> AbstractContextManager[SensorOver]:
-        """Enter it for a `SensorOver`, a callable that makes the sensor.
+        """Open a `SensorOver`, which makes the sensor.
 
-        The callable gets the text of a world file, and the file's name for a ValueError. A sensor
+        It is called with the text of a world file, and the file's name for a ValueError. A sensor
         of the real world needs neither. Sensors know the robot's position, not its heading, speed
         or id.
 
@@ -133,8 +133,8 @@ class VehicleSetup(Protocol):
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
         """Read PX4's parameters, those that `lpac robot check` lists.
 
-        None for a parameter unknown to PX4, which is refused. A vehicle that is not a PX4 first
-        answers 0, keeps values that are set, and must behave as the parameters promise.
+        None for a parameter unknown to PX4, which is refused. A vehicle without PX4 answers 0 for
+        a parameter until it is set, then the set value, and must behave as the parameters promise.
         """
 
     def set_parameter(self, name: str, value: int | float) -> None:
@@ -179,8 +179,8 @@ class VehicleSetting(NamedTuple):
 class OpenVehicle(NamedTuple):
     """A vehicle, connected or not.
 
-    `watchdog(hold_after_s, land_after_s)` makes one that makes the vehicle hold when the control
-    loop has been silent for the first time, and land after the second time more.
+    `watchdog(hold_after_s, land_after_s)` opens a watchdog: the vehicle holds once the control loop
+    has been silent for `hold_after_s`, and lands after a silence of `land_after_s`, if it holds.
     """
 
     vehicle: Vehicle
@@ -192,7 +192,7 @@ class VehicleDriver(Protocol):
     """Type of vehicle. Its context is closed when the robot's program ends."""
 
     def __call__(self, setting: VehicleSetting) -> AbstractContextManager[OpenVehicle]:
-        """Raises ValueError or OSError, one line, also if another program of this machine uses it.
+        """Open the vehicle, which need not be connected yet.
 
-        A vehicle that is not connected yet is no error.
+        Raises ValueError or OSError, one line, also if another program on this machine uses it.
         """

@@ -164,6 +164,8 @@ class PositionJudgement(Struct, frozen=True):
 
 
 class _Finding(NamedTuple):
+    """A present cause of distrust; with `is_none`, the position counts as missing."""
+
     cause: PositionCause
     is_none: bool
     since_s: float

@@ -130,12 +130,12 @@ class VehicleState(Struct, frozen=True):
     `remote_control` and `thrust`, the requested share of the maximum thrust, 0 to 1, become None
     again 2.5 s after the last message. `problems` are the autopilot's reasons not to arm,
     `warnings` its faults while armed and reasons to take over, both with the most severe first.
-    `remote_control`: it receives one.
+    `remote_control`: whether it receives a remote control.
 
     `link_lost` is the share of the autopilot's messages lost in the last ten seconds, in steps of
-    0.05, `link_twice` whether they arrive more than once. `ignores_gps`: its estimator is set to
-    ignore the receiver. `version` is the firmware's, such as "1.17.0". `result` is the outcome of
-    the last completed command.
+    0.05, `link_twice` whether they arrive more than once. `ignores_gps`: whether its estimator is
+    set to ignore the receiver. `version` is the firmware's, such as "1.17.0". `result` is the
+    outcome of the last completed command.
     """
 
     connected: bool = False

@@ -132,7 +132,7 @@ def _in_steps(payload: F32) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.int
     padded[..., :size] = payload
     padded = padded.reshape(*payload.shape[:-1], blocks, _BLOCK)
     largest = np.abs(padded).max(axis=-1) / np.float32(_MOST_STEPS)
-    # One that is not finite stays so.
+    # Numbers that are not finite stay so.
     largest = np.where(np.isfinite(largest), np.minimum(largest, np.finfo(_STEP).max), largest)
     steps = largest.astype(_STEP)
     with np.errstate(over="ignore"):

@@ -92,8 +92,8 @@ def place_to_land(
 ) -> Point | None:
     """The nearest free place inside the fence, or the freest; None for the landing point.
 
-    Free is a distance from standing robots and from `others_m` as required of landing points.
-    `others_m` are the others' landing points, and the places of robots that return first.
+    A place is free if it is as far from standing robots and from `others_m` as landing points must
+    be. `others_m` are the others' landing points, and the places of robots that return first.
     `before_m`, the last choice, is kept while it is free.
     """
     if not in_the_way(landing_point_m, standing, errors):

@@ -62,12 +62,12 @@ class Lift(Struct, frozen=True):
         return since_s is not None and now_s - since_s >= _STANDS_S
 
     def entered(self, *, steered: bool) -> "Lift":
-        """The state after a transition. A lost height is forgotten only if nothing steers."""
+        """State after a transition; a lost height is forgotten unless the robot still steers."""
         return replace(self, slack_m=math.inf, off_since_s=self.off_since_s if steered else None)
 
 
 def update(lift: Lift, motion: Motion, now_s: float, dt_s: float) -> Lift:
-    """The state after a tick that came `dt_s` after the last one."""
+    """State after a tick, `dt_s` after the last one."""
     dt_s = min(max(dt_s, 0.0), _LONGEST_TICK_S)
     off_m = math.nan
     if motion.height_m is not None and motion.wanted_m is not None:

@@ -384,7 +384,7 @@ def _too_late(errors: ErrorBudget, others: Sequence[Beacon]) -> Iterator[FailedC
             if math.isfinite(flown_s)
             else "since before its program started"
         )
-        # A text that stays the same.
+        # Without a number that changes, so that the text stays the same.
         yield FailedCheck(
             _C.TAKEOFFS_TOO_FAR_APART,
             f"robot {robot_id} has been in the air {since}: heights have walked since then; wait "

@@ -110,10 +110,10 @@ class FlightMemory(Struct, frozen=True):
     """Memory of the state machine from tick to tick.
 
     `target_m` is the target of TAKEOFF and HOLD: x and y of the mission frame, and a height.
-    `reached`: since the state's begin the vehicle was seen as required: in offboard; in LAND
-    landing; in FAULT disarmed. `alarming`: the operator must see `reason`. After a lapse of the
-    control loop nothing is sent before `silent_until_s`, which stays set until the vehicle is in
-    offboard again. `failsafe_at_s` is when the autopilot's failsafe last acted,
+    `reached`: since the state began, the vehicle has reported what the state requires: offboard, in
+    LAND landing, in FAULT disarmed. `alarming`: the operator must see `reason`. After a lapse of
+    the control loop nothing is sent before `silent_until_s`, which stays set until the vehicle is
+    in offboard again. `failsafe_at_s` is when the autopilot's failsafe last acted,
     `remote_control_at_s` when the remote control was last heard, `ground_at_s` when the ground was
     last not lost. `alone_since_s` is set while the vehicle hovers without anybody's command: since
     when nobody has answered. `gps_ignored`: this program made the estimator ignore the receiver,

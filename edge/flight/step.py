@@ -38,9 +38,10 @@ _CLIMBS_SHARE = 0.5
 
 
 class Decision(NamedTuple):
-    """A tick's outcome; `new_trial`: the explored map and the neighbours' messages must be cleared.
+    """Outcome of a tick.
 
-    `taken` is the applied row of `TRANSITIONS`, None if the state stays.
+    With `new_trial`, the explored map and the neighbours' messages must be cleared. `taken` is the
+    applied row of `TRANSITIONS`, None if the state stays.
     """
 
     flight: FlightMemory
@@ -172,7 +173,7 @@ def _first_row(tick: Tick, ordered: str | None) -> tuple[Transition | None, str]
 
 
 def enter(row: Transition, reason: str, t: Tick) -> FlightMemory:
-    """The memory at the begin of the row's target; `reason` is its text."""
+    """Memory on entering the row's target state; `reason` is the text of its reason."""
     flight, now_s = t.flight, t.inputs.now_s
     from_offboard = flight.state in (_S.ARMING, *STEERED)
     stays_offboard = from_offboard and row.target in STEERED and not row.drops_observations

@@ -62,7 +62,7 @@ class FlightControl:
 
     Other threads set these fields whole: `checks`, `revoked` (revoked robots), `px4_change`, and
     `world` for the `wanted_world_id`. `obeyed_sequence` and `operator` are the last ground state's.
-    `assignment` is in use, `not_taken` lists the parts of the ground's state that are not.
+    `assignment` is in use, `not_taken` lists the parts of the ground's state that are not in use.
     `fell_silent` is as in `FlightInputs`, `energy` the battery's estimate.
     """
 

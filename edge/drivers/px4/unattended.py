@@ -1,7 +1,7 @@
-"""Lands an unattended vehicle: it hovers in PX4's hold mode while the robot's program hangs.
+"""Lands an unattended vehicle, which hovers in PX4's hold mode.
 
-The program may also have died. The two share nothing but the socket, and this module needs the
-standard library only. Once anybody selects another mode, the vehicle is theirs and is not landed.
+The robot's program hangs or has died. This module shares only the socket with it, and needs the
+standard library alone. Once anybody selects another mode, the vehicle is theirs and is not landed.
 """
 
 import os

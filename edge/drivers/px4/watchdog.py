@@ -1,10 +1,10 @@
 """Watchdog process: commands hold when the robot's control loop falls silent.
 
-It does not hang with the robot's program, whether a loop, the interpreter or the whole process
-hangs. It lands a vehicle that it commanded to hold and that nobody has taken since. If the watchdog
-dies too, PX4's own failsafe lands the vehicle a moment later. It loads the standard library only,
-to need little memory, and sends its two MAVLink messages through the socket that the robot's
-program uses for PX4.
+A process of its own, it still runs when a loop, the interpreter or the whole program hangs. It
+lands a vehicle that it commanded to hold and that nobody has taken since. If the watchdog dies too,
+PX4's own failsafe lands the vehicle a moment later. It loads the standard library only, to need
+little memory, and sends its two MAVLink messages through the socket that the robot's program uses
+for PX4.
 """
 
 import os
