@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import AsJson, Ray, folder_lock, found, pool
+from lpac.cli.options import AsJson, Ray, existing, folder_lock, pool
 from lpac.cli.printing import BAD, GOOD, print_table, progress_of_run, styled, time_left
 from lpac.cli.train import numbers_of_training
 
@@ -28,7 +28,8 @@ _STYLES = {"better": GOOD, "worse": BAD}
 def ablate(
     *,
     ablation: Annotated[
-        Path, typer.Argument(callback=found, help="What to compare: see examples/ablation.toml.")
+        Path,
+        typer.Argument(callback=existing, help="The ablation: see examples/ablation.toml."),
     ],
     out: Annotated[
         Path | None,

@@ -18,7 +18,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the figure and the flights.")] = Path(
         "out/demo"
     ),
-    seed: Annotated[int, typer.Option(help="Of world, starts, clocks and losses.")] = 7,
+    seed: Annotated[int, typer.Option(help="Seed of world, starts, clocks and losses.")] = 7,
 ) -> None:
     """Fly ten robots and the baselines over an unknown world for 60 s, and draw a figure."""
     from lpac.sim.flight_files import write_demo

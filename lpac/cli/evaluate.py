@@ -17,7 +17,7 @@ from lpac.cli.options import (
     Ray,
     VehicleKind,
     check_px4,
-    found,
+    existing,
     require_here,
 )
 from lpac.cli.study import StudyTask, fly_study
@@ -136,7 +136,7 @@ def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
     """Compare policies and baselines over many worlds, with confidence intervals."""
     given = options.methods or [str(DEFAULT_BUNDLE)]
     for path in (part for text in given for part in text.split(",") if "/" in part):
-        found(Path(path))
+        existing(Path(path))
     from lpac.study.file import condition_of
     from lpac.study.study import Study
     from lpac.study.worlds import SET_UPS, WORLD_SETS

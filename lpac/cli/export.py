@@ -7,7 +7,7 @@ import typer
 
 from lpac.cli.apps import new_app
 from lpac.cli.bundle import show
-from lpac.cli.options import found
+from lpac.cli.options import existing
 from lpac.cli.printing import working
 
 app = new_app()
@@ -18,13 +18,15 @@ def export(
     checkpoint: Annotated[
         Path,
         typer.Argument(
-            callback=found, help="LPAC state dict (.pt), or the authors' folder of tensors."
+            callback=existing,
+            help="LPAC state dict (.pt), or the authors' folder of tensors.",
         ),
     ],
     params: Annotated[
         Path,
         typer.Option(
-            callback=found, help="Our parameter file (TOML), or a coverage_control_params.toml."
+            callback=existing,
+            help="Our parameter file (TOML), or a coverage_control_params.toml.",
         ),
     ],
     output: Annotated[
@@ -37,7 +39,8 @@ def export(
     cnn: Annotated[
         Path | None,
         typer.Option(
-            callback=found, help="State dict whose CNN is taken, such as for the authors' folder."
+            callback=existing,
+            help="State dict whose CNN is used, for example with the authors' folder.",
         ),
     ] = None,
     force: Annotated[

@@ -109,7 +109,7 @@ def folder_lock(what: str, folder: Path) -> "ProcessLock":
     return ProcessLock(f"{what} in {last_part}")
 
 
-def found(path: Path | None) -> Path | None:
+def existing(path: Path | None) -> Path | None:
     """Option callback: raise OSError for a missing file before slow imports."""
     if path is not None:
         path.stat()

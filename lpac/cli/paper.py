@@ -18,7 +18,7 @@ from lpac.cli.options import (
     Ray,
     VehicleKind,
     check_px4,
-    found,
+    existing,
     pool,
     require_here,
 )
@@ -69,7 +69,8 @@ class ExperimentOptions:
     logs: Annotated[
         Path | None,
         typer.Option(
-            callback=found, help="Folder of flight logs, such as a field day's; nothing is flown."
+            callback=existing,
+            help="Folder of flight logs, such as a field day's; nothing is flown.",
         ),
     ] = None
     trial: Annotated[
@@ -176,7 +177,7 @@ def _check(name: str, options: ExperimentOptions, changes: Changes) -> None:
     if changes.trials is not None and changes.trials < 2:
         raise ValueError(f"--trials {changes.trials}: must be at least 2")
     for path in options.bundles or ():
-        found(path)
+        existing(path)
     if len(options.bundles or ()) > 1 and (name != "transfer" or options.logs is not None):
         raise ValueError("one bundle flew, so give --bundle once")
     if options.logs is not None:

@@ -66,8 +66,8 @@ def _watch_over(fleet: "Fleet", display: "FleetDisplay") -> None:
     raise SimulatedFleetError("the programs of all robots have ended")
 
 
-def as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
-    """Number of robots that this machine can run, from 1 to 10; prints it."""
+def choose_robot_count(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
+    """Print and return the number of robots that this machine can run, from 1 to 10."""
     from lpac.sim.fleet.load import robots_carried
 
     carried = int(robots_carried(bundle, vehicle))
@@ -76,7 +76,7 @@ def as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
     return robots
 
 
-def say_if_carried(
+def report_capacity(
     robots: int | None, bundle: Path, vehicle: Literal["mavlink", "px4"]
 ) -> int | None:
     """Print and return how many robots this machine can run, with advice if they are too few.

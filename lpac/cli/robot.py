@@ -97,14 +97,17 @@ def _print_changes(changes: Iterable[str], problems: Iterable[str]) -> None:
 @app.command()
 def setup(
     *,
-    system_id: Annotated[int, typer.Option(min=1, max=255, help="The MAV_SYS_ID it is to have.")],
-    rc: Annotated[Rc, typer.Option(help="Whether somebody holds a remote control.")],
-    ceiling: Annotated[float, typer.Option(help="The fence's, above the pad, m.")],
+    system_id: Annotated[int, typer.Option(min=1, max=255, help="The MAV_SYS_ID to set.")],
+    rc: Annotated[Rc, typer.Option(help="Whether a pilot holds a remote control.")],
+    ceiling: Annotated[float, typer.Option(help="The fence's ceiling above the pad, m.")],
     url: Annotated[
-        str, typer.Option(help="Where PX4's MAVLink arrives.")
+        str, typer.Option(help="Address at which PX4's MAVLink arrives.")
     ] = "udpin://127.0.0.1:14551",
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Another address than 127.0.0.1, which others reach.")
+        bool,
+        typer.Option(
+            "--insecure", help="Allow an address other than 127.0.0.1, which others reach."
+        ),
     ] = False,
     command_timeout: Annotated[
         float, typer.Option(help="Time after which a hung program's vehicle holds, s.")

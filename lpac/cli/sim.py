@@ -27,7 +27,7 @@ from lpac.cli.options import (
     check_px4,
 )
 from lpac.cli.printing import periodic_lines, progress_of
-from lpac.cli.programs import as_many_as_carried, say_if_carried, serve
+from lpac.cli.programs import choose_robot_count, report_capacity, serve
 from lpac.cli.transport import Transport, WifiFile, calibration, wifi_lines
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
         record = _fly_on_clock(scenario, run)
     else:
         if count is None:
-            scenario = replace(scenario, robots=as_many_as_carried(run.bundle, _programs(run)))
+            scenario = replace(scenario, robots=choose_robot_count(run.bundle, _programs(run)))
         if not run.script:
             _serve(scenario, run, count)
             return
@@ -337,7 +337,7 @@ def _fly_programs(scenario: "Scenario", run: RunOptions, count: int | None) -> "
 
     # SIGTERM must end the fleet as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    carries = partial(say_if_carried, count, run.bundle, _programs(run))
+    carries = partial(report_capacity, count, run.bundle, _programs(run))
     with FleetDisplay(scenario.robots) as display:
         engine = Programs(run.px4, display.say, carries)
         [record] = engine.fly([scenario], run.bundle, run.out, show)
@@ -353,7 +353,7 @@ def _serve(scenario: "Scenario", run: RunOptions, count: int | None) -> None:
         with FleetDisplay(scenario.robots) as display:
             out = run.out or DEFAULT_OUT
             fleet = Fleet(scenario, out, run.bundle, px4_build=run.px4, report=display.say)
-            fleet.carried = say_if_carried(count, run.bundle, _programs(run))
+            fleet.carried = report_capacity(count, run.bundle, _programs(run))
             serve(fleet, out / fleet.fleet_toml.name, display)
     except KeyboardInterrupt:
         typer.echo("ended")

@@ -51,7 +51,7 @@ class SiteOptions:
 def save(site: SiteOptions, of: OfFleet) -> None:
     """Save origin, fence, and the present positions of the slots' robots as pads.
 
-    The robots get nothing until `lpac site use NAME`.
+    Nothing is sent to the robots until `lpac site use NAME`.
     """
     from lpac.ground.site import Sites
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import AsJson, Px4, Ray, folder_lock, found, pool
+from lpac.cli.options import AsJson, Px4, Ray, existing, folder_lock, pool
 from lpac.cli.printing import print_table, progress_of
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _OUT = Path("out/study")
 def study(
     *,
     file: Annotated[
-        Path, typer.Argument(callback=found, help="The study: see examples/study.toml.")
+        Path, typer.Argument(callback=existing, help="The study: see examples/study.toml.")
     ],
     px4: Px4 = None,
     ray: Ray = None,

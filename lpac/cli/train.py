@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import AsJson, Ray, folder_lock, found, pool
+from lpac.cli.options import AsJson, Ray, existing, folder_lock, pool
 from lpac.cli.printing import print_table, progress_of_run, time_left
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _OUT = Path("out/train")
 @app.command()
 def train(
     *,
-    config: Annotated[Path, typer.Argument(callback=found, help="What to train: see examples/.")],
+    config: Annotated[Path, typer.Argument(callback=existing, help="The training: see examples/.")],
     out: Annotated[
         Path | None,
         typer.Option(help="Output folder; out/train and the policy's name if none."),

@@ -413,7 +413,7 @@ def again(
 
 @app.command()
 def command(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
-    """Take the command of the fleet from another ground station."""
+    """Take command of the fleet from another ground station."""
     from lpac.ground.station.protocol import TakeCommand
 
     ask(address(fleet, None), TakeCommand(), "command", as_json=as_json)

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from lpac.analysis.flight import ScriptRecord
 from lpac.cli import sim as cli
-from lpac.cli.programs import as_many_as_carried, say_if_carried
+from lpac.cli.programs import choose_robot_count, report_capacity
 from lpac.sim.fleet import load
 from lpac.sim.fleet.processes import Backlog, OverloadError
 from lpac.sim.scenario import Scenario
@@ -26,7 +26,7 @@ def test_as_many_robots_fly_as_the_machine_carries(
     robots: int,
 ) -> None:
     monkeypatch.setattr(load, "_units_per_s", lambda _: units_per_s)
-    assert as_many_as_carried(SHIPPED, "mavlink") == robots
+    assert choose_robot_count(SHIPPED, "mavlink") == robots
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f": flying {robots}")
 
@@ -63,10 +63,10 @@ def test_who_asks_for_more_is_warned(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(load, "_units_per_s", lambda _: FIVE_FLEW)
-    assert say_if_carried(5, SHIPPED, "mavlink") == 5
+    assert report_capacity(5, SHIPPED, "mavlink") == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("carries about 5 of these robots and vehicles")
-    assert say_if_carried(6, SHIPPED, "mavlink") == 5
+    assert report_capacity(6, SHIPPED, "mavlink") == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert (
         "carries about 5 of these robots" in line
