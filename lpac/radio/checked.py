@@ -70,9 +70,9 @@ class Checked(NamedTuple):
         return [self._record(pair) for pair in found]
 
     def _record(self, pair: Pair) -> RadioRecord:
-        said, heard = self.windows[pair.sender], self.windows[pair.receiver]
-        place_m, other_m = said.last.position_m, heard.last.position_m
-        heading_rad = said.last.heading_rad
+        sender, receiver = self.windows[pair.sender], self.windows[pair.receiver]
+        place_m, other_m = sender.last.position_m, receiver.last.position_m
+        heading_rad = sender.last.heading_rad
         wifi = self.wifi.get(pair.receiver, WifiReading())
         traffic = self.traffic
         assert traffic is not None
@@ -81,8 +81,8 @@ class Checked(NamedTuple):
             receiver=pair.receiver,
             transport=self.transport,
             robots=traffic.robots,
-            message_bytes=said.bytes_sent / said.sent + self.overhead_bytes,
-            message_hz=said.rate_hz,
+            message_bytes=sender.bytes_sent / sender.sent + self.overhead_bytes,
+            message_hz=sender.rate_hz,
             sent=pair.sent,
             received=pair.received,
             age_p50_s=pair.age_p50_s,

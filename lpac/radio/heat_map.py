@@ -1,4 +1,4 @@
-"""Heat map of links: the share that was lost, and how old the rest was."""
+"""Heat map of links: share of lost messages, and age of the others."""
 
 import textwrap
 from collections.abc import Sequence
@@ -10,13 +10,13 @@ from lpac.analysis import style
 from lpac.analysis.figures import draw_matrix
 from lpac.radio.pairs import LATE_S, Pair
 
-# In characters.
+# Characters on a line.
 _TITLE_WIDTH = 90
 _MUCH_LOST = 50.0
 
 
 def draw(robots: Sequence[str], pairs: Sequence[Pair], title: str, path: Path) -> None:
-    """`path`.png and .pdf. Raises OSError."""
+    """Draw `path`.png and .pdf. Raises OSError."""
     lost, age_ms = np.full((2, len(robots), len(robots)), np.nan)
     for pair in pairs:
         link = robots.index(pair.receiver), robots.index(pair.sender)

@@ -30,7 +30,7 @@ class Window(NamedTuple):
 
     @property
     def counts(self) -> tuple[RadioCounts, RadioCounts]:
-        """Counts at the begin and at the end."""
+        """First and last counts."""
         first, last = self.first.radio_counts, self.last.radio_counts
         assert first is not None and last is not None
         return first, last
@@ -42,7 +42,7 @@ class Window(NamedTuple):
 
     @property
     def sent(self) -> int:
-        """Number of messages of its policy."""
+        """Number of messages that its policy sent."""
         first, last = self.counts
         return last.sent - first.sent
 
@@ -66,8 +66,10 @@ class Window(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Of `sent` messages to the receiver, `received` arrived, `late` of them at an age of 0.8 s or
-    more. Ages are None if unknown; see `Arrivals.age_s`."""
+    """Messages from `sender` to `receiver`: `sent`, `received`, and `late` of these.
+
+    A message is late at an age of 0.8 s or more. Ages are None if unknown; see `Arrivals.age_s`.
+    """
 
     sender: str
     receiver: str
@@ -94,7 +96,7 @@ class Pair(NamedTuple):
 
 
 def pairs(windows: Mapping[str, Window]) -> tuple[Pair, ...]:
-    """Pairs of which the sender sent anything; windows must be of about the same time."""
+    """Pairs whose sender sent any message; windows must be of about the same time."""
     found = (
         _pair(sender, receiver, windows[sender], windows[receiver])
         for receiver in windows
@@ -106,8 +108,8 @@ def pairs(windows: Mapping[str, Window]) -> tuple[Pair, ...]:
 
 def _pair(sender: str, receiver: str, sent_in: Window, received_in: Window) -> Pair | None:
     arrivals = received_in.arrivals(sent_in.last.robot_id)
-    # The receiver knows best about losses between arrived messages. The sender's count tells about
-    # those before, after, and about lost links.
+    # The receiver knows best about losses between arrived messages. Losses before, after, and of
+    # whole links follow from the sender's count.
     expected, apart = sent_in.rate_hz * received_in.duration_s, sent_in.rate_hz * _APART_S + 1.0
     sent = round(min(max(arrivals.sent, expected - apart), expected + apart))
     if sent_in.sent < 1 or sent < 1:

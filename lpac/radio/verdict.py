@@ -12,13 +12,13 @@ from lpac.radio.airtime import Wifi, airtime, capacity
 from lpac.radio.checked import Checked, WifiReading
 from lpac.radio.pairs import LATE_S, Pair, blame
 
-# A mesh repeats lost messages until they arrive, so a larger loss is the radio's fault; in
-# multicast it is one that exceeds the chance of lost frames.
+# A mesh repeats lost messages, so a larger loss is the radio's fault. In multicast it is the
+# radio's fault if it exceeds the expected loss of frames by more than chance.
 LEAST_DELIVERED = 0.95
 _CHANCE_DEVIATIONS = 3.0
-# Robots do not use late messages; and if so many are late, queues are filling.
+# Robots discard late messages; above this share, queues are filling.
 MOST_LATE = 0.01
-# Of a check's fifty messages, one lost or late is chance.
+# A check has fifty messages: one lost or late is chance.
 _BY_CHANCE = 1
 # Share of a channel's time, with gaps, above which delays grow quickly (docs/network.md).
 MOST_BUSY = 0.6
@@ -113,7 +113,7 @@ def _sentence(checked: Checked, room: Room | None, problems: Sequence[str]) -> s
     if problems:
         more = len(problems) - 1
         return problems[0] + (f"; and {more} more" if more else "")
-    # Without senders there is a problem.
+    # Without senders, there are problems, and this is not reached.
     assert room is not None
     of_which, beside = "", " beside a bulk stream" if checked.loaded else ""
     if room.robots > len(checked.robots):
@@ -174,8 +174,8 @@ def _unheard(checked: Checked, pairs: Sequence[Pair]) -> Iterator[_Found]:
             return ""
         return f" (its signal is weak: {signal_dbm:.0f} dBm)"
 
-    def problem(its: Sequence[Pair], lost: str, late: str, name: str) -> _Found:
-        total = _sum(its)
+    def problem(bad: Sequence[Pair], lost: str, late: str, name: str) -> _Found:
+        total = _sum(bad)
         if total.sent - total.received >= total.late:
             text = lost.replace("SHARE", _percent(total.delivered))
         else:
@@ -184,17 +184,17 @@ def _unheard(checked: Checked, pairs: Sequence[Pair]) -> Iterator[_Found]:
         return 1.0 - total.in_time, text + weak(name)
 
     for name in found.receivers:
-        its = [pair for pair in pairs if pair.receiver == name]
+        bad = [pair for pair in pairs if pair.receiver == name]
         yield problem(
-            its, f"{name} hears SHARE of the others", f"messages come late to {name}", name
+            bad, f"{name} hears SHARE of the others", f"messages come late to {name}", name
         )
     for name in found.senders:
-        its = [pair for pair in pairs if pair.sender == name]
-        yield problem(its, f"the others hear SHARE of {name}", f"{name}'s messages come late", name)
+        bad = [pair for pair in pairs if pair.sender == name]
+        yield problem(bad, f"the others hear SHARE of {name}", f"{name}'s messages come late", name)
     for sender, receiver in found.links:
-        its = [pair for pair in pairs if (pair.sender, pair.receiver) == (sender, receiver)]
+        bad = [pair for pair in pairs if (pair.sender, pair.receiver) == (sender, receiver)]
         late = f"{sender}'s messages come late to {receiver}"
-        yield problem(its, f"{receiver} hears SHARE of {sender}", late, receiver)
+        yield problem(bad, f"{receiver} hears SHARE of {sender}", late, receiver)
 
 
 def _sum(pairs: Sequence[Pair]) -> Pair:
