@@ -67,7 +67,7 @@ class Coverage:
 
     @classmethod
     def known(cls, world: World) -> "Coverage | None":
-        """None if the world's text is not known, or no world file."""
+        """Like `of`; None if the text is unknown or invalid."""
         try:
             return cls.of(world) if world.world else None
         except ValueError:
@@ -181,7 +181,7 @@ def _random_starts(importance: F32, robots: int, count: int) -> list[F64]:
     rng = np.random.default_rng(_SEED)
     drawn = rng.choice(len(weights), (count, robots), p=weights / weights.sum())
     cells = np.stack(np.unravel_index(drawn, importance.shape), axis=-1)
-    # Distributed within the cell: of robots at one point, only one would own an area.
+    # Spread within the cell: only one of several robots at one point would own an area.
     return list(cells + rng.random(cells.shape))
 
 

@@ -8,9 +8,9 @@ reports and figures: `lpac sim` and `lpac report` give identical numbers for a f
 - **J**, the coverage cost, is evaluated at `cost_time_s`: each second of a fleet's flight, and at
   its end. Robots of the mission count while they report to be in the air (`in_air`), at their
   estimated positions, interpolated between two that are at most `FRESH_S` apart, else at the last
-  one. A robot without a status for longer does not count. A robot that reports to fly, but no
-  position, does, since the cost would jump. **True J** counts the same robots at their vehicles'
-  true positions. Both are normalised by their own first value.
+  one. A robot without a status for longer does not count. A robot in the air that reports no
+  position counts, since the cost would jump otherwise. **True J** counts the same robots at their
+  vehicles' true positions. Both are normalised by their own first value.
 - The **least separation** is the 3-D distance of two robots in the air; the **fence margin** is the
   least horizontal distance inside the fence in the air. With estimated positions, both are from the
   mission's takeoff to its landing; with true positions, of all vehicles from the end of the mission
@@ -311,7 +311,7 @@ class FlightRecord:
 
     @property
     def of_points(self) -> bool:
-        """Whether it is of points, which are where they take themselves to be."""
+        """Whether the robots are points, whose positions are true ones."""
         return not any(robot.statuses for robot in self.robots)
 
     @property
@@ -344,7 +344,7 @@ class FlightRecord:
 
     @property
     def all_landed(self) -> bool:
-        """Whether the fleet took off, and all robots are down and disarmed, also in truth."""
+        """Whether the fleet took off, and all are down and disarmed by reports and true tracks."""
         return (
             self.took_off
             and not any(track.airborne[-1:].any() for track in self.vehicles)

@@ -39,7 +39,7 @@ from lpac.analysis.field_truth import (
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.truth import TRUTH, TrueTrack, load_truth
 
-# Quantile of the transmission delays that is taken as the least one.
+# Quantile of the transmission delays that estimates the least one.
 _EARLY = 0.1
 _LATENESS = ("lateness_p50_ms", "lateness_p99_ms", "lateness_max_ms")
 
@@ -219,7 +219,7 @@ class _LogReader:
                 notes.append(f"{error}: skipped")
             return
         # topic -> reason for each skipped message
-        odd: dict[str, list[str]] = defaultdict(list)
+        skipped: dict[str, list[str]] = defaultdict(list)
         begun = False
         try:
             if path.name.startswith("ground-"):
@@ -233,9 +233,9 @@ class _LogReader:
                 try:
                     take(topic, time_s, message)
                 except KeyError as error:
-                    odd[topic].append(f"{error} is missing")
+                    skipped[topic].append(f"{error} is missing")
                 except (AttributeError, OverflowError, TypeError, ValueError) as error:
-                    odd[topic].append(str(error))
+                    skipped[topic].append(str(error))
             notes += map(str, gaps)
             if not begun and not gaps:
                 notes.append(f"{path}: is empty")
@@ -245,7 +245,7 @@ class _LogReader:
             notes.append(f"{path}: {error}: the rest is skipped")
         notes += [
             f"{path}: {why[0]}: {counted(len(why), 'message')} of topic {topic} skipped"
-            for topic, why in odd.items()
+            for topic, why in skipped.items()
         ]
 
     def _begin_robot(self, path: Path) -> Program:
@@ -336,7 +336,7 @@ class _LogReader:
 
     def logs(self) -> Logs:
         logs = self._logs
-        # By program: its start on the common clock, and how far its own clock is ahead.
+        # program -> its start on the common clock, and the lead of its own clock
         starts_s: dict[Program, float] = {}
         ahead_s: dict[Program, float] = {}
         for program, statuses in self._statuses.items():

@@ -9,7 +9,7 @@ from edge.messages.mission import GroundState, Place, RobotStatus
 
 # A robot without a status for longer is stale.
 FRESH_S = 2.0
-# A commander that was silent for longer is gone.
+# A commander that is silent for longer counts as lost.
 COMMANDER_SILENT_S = 2.0
 # The state while nobody has commanded yet.
 NO_STATE = GroundState(0, "")
@@ -65,7 +65,7 @@ class FleetSetup:
 class RobotSnapshot:
     """A robot as known to the ground; `status` is the newest one, None if there was none.
 
-    `age_s` is the status's age, `clock_offset_s` how far the robot's clock is ahead of this one.
+    `age_s` is the status's age; the robot's clock is `clock_offset_s` ahead of this one.
     `rates_hz` are the rates of messages from each neighbour (robot id as text) over the last few
     seconds, `arrivals` their counts by fate in the last ten (`Arrivals.counts`). `duplicate`: two
     programs use this robot's id. `other_release` is its release, "" if it is the ground's.

@@ -57,7 +57,7 @@ def coverage_cost(importance: F32, positions: F64) -> float:
 def voronoi_cells(importance: F32, positions: F64) -> VoronoiCells:
     """Voronoi cells of robots at `positions` (N, 2), N >= 1, on `importance` (rows, columns).
 
-    Of equally near robots the first owns a raster cell, so of several robots at one point the first
+    The first of equally near robots owns a raster cell, so the first of several robots at one point
     owns all of their cells. (The reference library counts these cells, and their cost, once per
     robot.)
 
@@ -114,7 +114,7 @@ class _Block(NamedTuple):
 def _blocks(importance: F32, positions: F64) -> Iterator[_Block]:
     """Cut the raster into blocks with few robots each, without blocks of no importance."""
     x, y = (np.arange(cells, dtype=np.float64) + 0.5 for cells in importance.shape)
-    # Of robots at one point only the first owns cells; drop the others.
+    # Only the first of several robots at one point owns cells; drop the others.
     first_at_point = np.sort(np.unique(positions, axis=0, return_index=True)[1])
     todo = [(0, len(x), 0, len(y), first_at_point)]
     while todo:
