@@ -1,4 +1,4 @@
-"""Lateness of control while nobody, an outsider and members flood the radio."""
+"""Lateness of control without a flood, and while an outsider or a member floods the radio."""
 
 import itertools
 import json
@@ -24,7 +24,7 @@ from lpac.sim.fleet.processes import Fleet
 from lpac.sim.scenario import Scenario
 
 RATE_HZ = 10_000
-# Each message in its turn: of one robot, of the ground, and of names that nobody has.
+# Keys to publish on in turn: a robot's, the ground's, and those of robots that do not exist.
 _OUTSIDERS = ("robot/2/message", "ground/state", *(f"robot/{id_}/message" for id_ in range(9, 109)))
 _MEMBERS = ("robot/2/message",)
 _WHO = ("nobody", "an outsider", "a member", "a member who signs")
@@ -32,7 +32,7 @@ _STEP_S = 0.01
 
 
 def measure(robots: int = 3, mission_s: float = 60.0) -> Result:
-    """Fly a mission of `robots` robots for each; members flood with what robot 2 has."""
+    """Fly a mission of `robots` robots with each kind of flood; members have robot 2's keys."""
     rows, p99_ms = [], {}
     for who in _WHO:
         progress(f"flood: {robots} robots fly, {who} floods, about two minutes")
@@ -58,7 +58,7 @@ def measure(robots: int = 3, mission_s: float = 60.0) -> Result:
 
 
 def _fly(who: str, robots: int, mission_s: float) -> tuple[list[float], float]:
-    """Lateness of each robot at the mission's end, p99 ms, and how many messages a second came."""
+    """Lateness of each robot at the mission's end, p99 ms, and messages sent per second."""
     spawning = multiprocessing.get_context("spawn")
     over, sent, began_s, lasted_s = spawning.Event(), spawning.Value("q", 0), 0.0, 1.0
     late_ms: list[float] = []
@@ -66,8 +66,8 @@ def _fly(who: str, robots: int, mission_s: float) -> tuple[list[float], float]:
     def watch(moment: FleetMoment) -> None:
         nonlocal began_s, lasted_s, late_ms
         if moment.step == "mission":
-            loops = [status.loops for status in moment.statuses.values()]
-            late_ms = [its["control"].lateness_p99_ms for its in loops if "control" in its]
+            loops = [status.loops.get("control") for status in moment.statuses.values()]
+            late_ms = [loop.lateness_p99_ms for loop in loops if loop is not None]
             if not began_s:
                 began_s = time.monotonic()
                 if who != "nobody":

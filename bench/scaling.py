@@ -24,7 +24,7 @@ EXACT, BATCHED = "exact", "batched"
 _ROBOTS_PER_WORLD = 10
 # (robots, simulated seconds, flights)
 _FLIGHTS = ((10, 30.0, 3), (100, 6.0, 3), (1000, 2.0, 1))
-# A robot's memory grows with time, so all are weighed at the same time.
+# A robot's memory grows with time, so all are measured at the same time.
 _MEMORY_AT_S = 2.0
 
 

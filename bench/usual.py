@@ -53,7 +53,7 @@ def measure(points: int = 100, whole: int = 30) -> Result:
         "bundle_id": load_bundle(SHIPPED_BUNDLE).id,
         "columns": Usual._fields,
         **{
-            kind: [each for (its, _), each in usual.items() if its == kind]
+            kind: [each for (of, _), each in usual.items() if of == kind]
             for kind in ("points", "whole")
         },
     }

@@ -38,25 +38,25 @@ def _context(command: Any, parent: Any, name: str) -> Any:
 
 
 def _walk(group: Any, context: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield each command below a group with its context, groups first."""
+    """Yield each command below a group with child context, groups first."""
     for name in group.list_commands(context):
         command = group.get_command(context, name)
-        its = _context(command, context, name)
-        yield command, its
+        child = _context(command, context, name)
+        yield command, child
         if hasattr(command, "list_commands"):
-            yield from _walk(command, its)
+            yield from _walk(command, child)
 
 
 def _below(root: Any, context: Any) -> Iterator[str]:
-    for command, its in _walk(root, context):
-        depth = len(its.command_path.split())
-        yield f"{'#' * depth} {its.command_path}"
+    for command, child in _walk(root, context):
+        depth = len(child.command_path.split())
+        yield f"{'#' * depth} {child.command_path}"
         yield "\n".join(line.strip() for line in (command.help or "").splitlines())
         if hasattr(command, "list_commands"):
             continue
-        pieces = " ".join(piece for piece in command.collect_usage_pieces(its))
-        yield f"```text\n{its.command_path} {pieces}\n```"
-        records = [parameter.get_help_record(its) for parameter in command.get_params(its)]
+        pieces = " ".join(piece for piece in command.collect_usage_pieces(child))
+        yield f"```text\n{child.command_path} {pieces}\n```"
+        records = [parameter.get_help_record(child) for parameter in command.get_params(child)]
         rows = [
             (code(name), cell(text.replace(f"{_ROOT}/", "")))
             for name, text in filter(None, records)

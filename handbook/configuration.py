@@ -178,15 +178,15 @@ def _tables(
         hint = _hints(cls)[field.name]
         within = _within(hint)
         if within is not None and field.name not in but:
-            its = f"{path}.{field.name}" if path else field.name
+            place = f"{path}.{field.name}" if path else field.name
             several = "list of tables" in _kind(hint)
-            below.append((within, its, f"[[{its}]]" if several else f"[{its}]"))
+            below.append((within, place, f"[[{place}]]" if several else f"[{place}]"))
         about = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, str)]
         rows.append((f"`{field.name}`", cell("; ".join([_kind(hint), *about])), _default(field)))
     if rows:
         yield table(("key", "value", "default"), rows)
-    for within, its, heading in below:
-        yield from _tables(within, its, heading)
+    for within, place, heading in below:
+        yield from _tables(within, place, heading)
 
 
 def _about(cls: type[Any]) -> str:

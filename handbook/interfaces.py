@@ -133,16 +133,16 @@ def _described(thing: object, name: str, heading: str, imported: str = "") -> st
         parts.append(f"`from {imported} import {name}`")
     if inspect.isclass(thing):
         parts += [_class(thing), inspect.getdoc(thing) or ""]
-        for method, its in _methods(thing):
-            text, shown = inspect.getdoc(its) or "", method.replace("__", "\\_\\_")
-            parts.append(f"{heading}# {name}.{shown}\n\n{_member(its)}\n\n{text}")
+        for method, member in _methods(thing):
+            text, shown = inspect.getdoc(member) or "", method.replace("__", "\\_\\_")
+            parts.append(f"{heading}# {name}.{shown}\n\n{_member(member)}\n\n{text}")
     elif inspect.isfunction(thing):
         parts += [_function(thing), inspect.getdoc(thing) or ""]
     elif inspect.ismodule(thing):
         parts += [inspect.getdoc(thing) or "", _constants(thing)]
-        for function, its in inspect.getmembers(thing, inspect.isfunction):
-            if its.__module__ == thing.__name__ and not function.startswith("_"):
-                parts.append(_described(its, f"{name}.{function}", f"{heading}#"))
+        for function, member in inspect.getmembers(thing, inspect.isfunction):
+            if member.__module__ == thing.__name__ and not function.startswith("_"):
+                parts.append(_described(member, f"{name}.{function}", f"{heading}#"))
     elif imported:
         parts += _assignment(import_module(imported), name)
     else:

@@ -73,11 +73,11 @@ def results_of(
     Trainings of a variant and of the base are independent, unless they are the same.
     """
     results: list[VariantResult] = []
-    for variant, (its, *_) in zip(ablation.variants, flown.values(), strict=True):
+    for variant, (result, *_) in zip(ablation.variants, flown.values(), strict=True):
         verdict = None
         if results:
-            verdict = compare(its.final, results[0].final, same_trainings=not variant.trained)
-        results.append(VariantResult(variant, its.method.trainings, its.final, verdict))
+            verdict = compare(result.final, results[0].final, same_trainings=not variant.trained)
+        results.append(VariantResult(variant, result.method.trainings, result.final, verdict))
     return results
 
 

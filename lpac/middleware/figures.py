@@ -63,13 +63,13 @@ def over_robots(runs: Sequence[Run]) -> Figure:
         left, right = figure.subplots(1, 2)
         of_each = summaries(runs)
         for middleware in dict.fromkeys(summary.middleware for summary in of_each):
-            its = [summary for summary in of_each if summary.middleware == middleware]
+            own = [summary for summary in of_each if summary.middleware == middleware]
             colour = _colour(of_each, middleware)
-            _curve(left, its, "throughput_mbit_s", colour, "-", title_of(middleware))
-            if any("age_p50_ms" in summary.measures for summary in its):
+            _curve(left, own, "throughput_mbit_s", colour, "-", title_of(middleware))
+            if any("age_p50_ms" in summary.measures for summary in own):
                 name = title_of(middleware)
-                _curve(right, its, "age_p50_ms", colour, "-", f"{name}, median")
-                _curve(right, its, "age_p99_ms", colour, style.DASHED, f"{name}, 99 %")
+                _curve(right, own, "age_p50_ms", colour, "-", f"{name}, median")
+                _curve(right, own, "age_p99_ms", colour, style.DASHED, f"{name}, 99 %")
         robots = sorted({summary.robots for summary in of_each})
         for axes, label in ((left, "throughput (Mbit/s)"), (right, "age of messages (ms)")):
             axes.set(xlabel="robots", ylabel=label, xlim=(robots[0] - 0.5, robots[-1] + 0.5))
@@ -86,9 +86,9 @@ def over_robots(runs: Sequence[Run]) -> Figure:
 
 
 def _curve(
-    axes: Axes, its: Sequence[Summary], measure: str, colour: str, dashes: object, name: str
+    axes: Axes, own: Sequence[Summary], measure: str, colour: str, dashes: object, name: str
 ) -> None:
-    points = [(summary.robots, summary.measures[measure]) for summary in its
+    points = [(summary.robots, summary.measures[measure]) for summary in own
             if measure in summary.measures]  # fmt: skip
     axes.errorbar(
         [robots for robots, _ in points], [spread.mean for _, spread in points],

@@ -21,7 +21,7 @@ class Sent(NamedTuple):
 
 
 class Reception(NamedTuple):
-    """Its reception by program number `by_start` of robot `by`."""
+    """Reception of such a message by program number `by_start` of robot `by`."""
 
     by: int
     by_start: int
@@ -159,10 +159,10 @@ def summaries(runs: Sequence[Run]) -> list[Summary]:
     kinds = dict.fromkeys((run.experiment, run.middleware, run.robots) for run in counted)
     found = []
     for kind in kinds:
-        its = [run for run in counted if (run.experiment, run.middleware, run.robots) == kind]
+        same = [run for run in counted if (run.experiment, run.middleware, run.robots) == kind]
         measures = {}
         for measure in MEASURES:
-            values = [value for run in its if (value := getattr(run, measure)) is not None]
+            values = [value for run in same if (value := getattr(run, measure)) is not None]
             if values:
                 deviation = statistics.stdev(values) if len(values) > 1 else None
                 measures[measure] = Spread(statistics.mean(values), deviation, len(values))

@@ -86,9 +86,9 @@ class _Program:
 
         def receive(data: bytes) -> None:
             at_ns = time.monotonic_ns()
-            robot, its_start, sequence, sent_ns = _HEAD.unpack_from(data)
+            robot, sender_start, sequence, sent_ns = _HEAD.unpack_from(data)
             if robot != self._index:
-                _write_line("received", start, robot, its_start, sequence, sent_ns, at_ns)
+                _write_line("received", start, robot, sender_start, sequence, sent_ns, at_ns)
 
         open_peer = MIDDLEWARES[middleware].open_peer()
         period_s = 1.0 / MESSAGE.rate_hz

@@ -1,1 +1,1 @@
-"""The paper's experiments, and those that it argues for without making them, one command each."""
+"""The paper's experiments, and others that its arguments call for, one command each."""

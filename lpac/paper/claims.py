@@ -135,14 +135,14 @@ def _decentralised(e3: Json) -> Claim:
 
 def _e1(e1: Json) -> list[Claim]:
     worlds = e1["flights"]
-    flown = [its.get(WHOLE_ROBOTS, its["lpac"]) for its in worlds.values()]
+    flown = [flights.get(WHOLE_ROBOTS, flights["lpac"]) for flights in worlds.values()]
     settled_s = [_settled_s(flight) for flight in flown]
     ends_s = [flight["time_s"][-1] for flight in flown]
-    is_whole = all(WHOLE_ROBOTS in its for its in worlds.values())
+    is_whole = all(WHOLE_ROBOTS in flights for flights in worlds.values())
     beside = ("lpac", "clairvoyant-cvt") if is_whole else ("clairvoyant-cvt",)
     finals = ", ".join(
-        f"{flight['final']:.3f} ({_finals(its[name] for name in beside)})"
-        for flight, its in zip(flown, worlds.values(), strict=True)
+        f"{flight['final']:.3f} ({_finals(flights[name] for name in beside)})"
+        for flight, flights in zip(flown, worlds.values(), strict=True)
     )
     others = "points' and clairvoyant Lloyd's" if is_whole else "clairvoyant Lloyd's"
     times = ", ".join(f"{time_s:.0f} s" for time_s in settled_s)

@@ -28,7 +28,7 @@ def experiment(
         methods = tuple(Method.of(bundle.name, bundle) for bundle in bundles)
         study = replace(study, methods=methods)
     if set_ups:
-        conditions = (condition_of({"set_up": its, "title": its}, "--set-up") for its in set_ups)
+        conditions = (condition_of({"set_up": each, "title": each}, "--set-up") for each in set_ups)
         study = replace(study, conditions=tuple(dict.fromkeys(conditions)))
     return study if engine == "point" else _whole(name, study, engine)
 

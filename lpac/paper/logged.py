@@ -58,7 +58,7 @@ class LoggedMissions:
     pool: Pool
     note: Callable[[str], object]
 
-    def that_flew(self, why: str) -> Bundle:
+    def flown_bundle(self, why: str) -> Bundle:
         """Load the bundle; `why` is the reason in errors.
 
         Raises ValueError if another bundle flew, or it cannot fly.
@@ -68,7 +68,7 @@ class LoggedMissions:
             raise ValueError(f"{self.bundle}: has no perception: it cannot fly")
         if len(flown) > 1:
             raise ValueError(
-                f"missions were flown by {' and '.join(its[:16] for its in flown)}: choose those "
+                f"missions were flown by {' and '.join(each[:16] for each in flown)}: choose those "
                 "of one bundle with --trial"
             )
         if bundle.id not in flown:
@@ -161,7 +161,7 @@ def _e3(of: LoggedMissions) -> Report:
     """
     if len(of.records) > 1:
         raise ValueError(f"{of.logs}: has {', '.join(of.records)}: choose one mission with --trial")
-    perception = of.that_flew("which has the communication range").manifest.perception
+    perception = of.flown_bundle("which has the communication range").manifest.perception
     assert perception is not None
     range_m = perception.communication_range / FIELD_SCALE.env_scale
     [record] = of.records.values()
@@ -171,7 +171,7 @@ def _e3(of: LoggedMissions) -> Report:
 
 def _async(of: LoggedMissions) -> Report:
     """Missions by their rates. Raises ValueError."""
-    bundle = of.that_flew("which has the size of messages")
+    bundle = of.flown_bundle("which has the size of messages")
     for name, record in of.records.items():
         if not is_comparable(record):
             why = (
@@ -190,12 +190,12 @@ def _transfer(of: LoggedMissions) -> Report:
 
     Raises ValueError if a mission began without robots in the air.
     """
-    bundle = of.that_flew("which has the baselines' sizes")
+    bundle = of.flown_bundle("which has the baselines' sizes")
     beside = _baselines_beside(of.records, of, sizes_of(bundle), [CLAIRVOYANT])
     for name in of.records:
         if name not in beside:
             raise ValueError(f"{name}: no robot was in the air at its begin: choose other missions")
-    clairvoyant = {name: its[CLAIRVOYANT] for name, its in beside.items()}
+    clairvoyant = {name: flights[CLAIRVOYANT] for name, flights in beside.items()}
     path = str(of.bundle.resolve())
     policy = Method(name="lpac", trainings=(TrainedBundle(path, bundle.id),))
     results = _by_team(of.records, clairvoyant, policy)

@@ -84,7 +84,7 @@ def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, 
     claims = claims_of(documents, sizes_of(bundle), effort_of(bundle))
     document = {
         "claims": [asdict(claim) for claim in claims],
-        "made_by": {name: dict(its) for name, its in made_by.items()},
+        "made_by": {name: dict(entries) for name, entries in made_by.items()},
     }
     (folder / "claims.json").write_text(json.dumps(document, indent=2) + "\n")
     path = folder / "index.html"

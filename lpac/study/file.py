@@ -113,8 +113,8 @@ def read_study(
     try:
         methods = [
             *(
-                Method.of(name, *([path.parent / one for one in its] or [Path(bundle)]))
-                for name, its in bundles.items()
+                Method.of(name, *([path.parent / one for one in paths] or [Path(bundle)]))
+                for name, paths in bundles.items()
             ),
             *map(Method.of, file.baselines),
         ]
@@ -242,8 +242,8 @@ def _combinations(
         if isinstance(value, list) and not _is_of_lists(hint):
             choices.append([(key, each) for each in value])
         elif isinstance(value, Mapping) and is_dataclass(hint):
-            its = _combinations(value, f"{where}: {key}", cast(type, hint))
-            choices.append([(key, each) for each in its])
+            nested = _combinations(value, f"{where}: {key}", cast(type, hint))
+            choices.append([(key, each) for each in nested])
         else:
             choices.append([(key, value)])
     return map(dict, itertools.product(*choices))

@@ -107,14 +107,14 @@ def results_of(
 
     Raises ValueError if no condition has it.
     """
-    timings = {Timing.of(condition.scenario): its[0] for condition, its in flown.items()}
+    timings = {Timing.of(condition.scenario): results[0] for condition, results in flown.items()}
     if FIELD not in timings:
         raise ValueError(
             "rates: no condition has the field's rates, with which others are compared"
         )
     results = [
-        TimingResult(timing, tuple(worlds), its.time_s, its.curves.mean(axis=0))
-        for timing, its in timings.items()
+        TimingResult(timing, tuple(worlds), result.time_s, result.curves.mean(axis=0))
+        for timing, result in timings.items()
     ]
     return _over_field(results, paired=True)
 
@@ -136,8 +136,8 @@ def results_of_logs(records: Mapping[str, FlightRecord]) -> list[TimingResult]:
             f"at {FIELD.policy_hz:g} Hz, with which others are compared"
         )
     results = [
-        TimingResult(timing, tuple(its), time_s, np.array(list(its.values())))
-        for timing, its in timings.items()
+        TimingResult(timing, tuple(curves), time_s, np.array(list(curves.values())))
+        for timing, curves in timings.items()
     ]
     return _over_field(results, paired=False)
 
@@ -240,8 +240,8 @@ def _rows(message_bytes: int, results: Sequence[TimingResult]) -> list[list[obje
         perception_hz, policy_hz, synchronous, delay_s = result.timing
         of_timing = [perception_hz, policy_hz, int(synchronous), delay_s, result.timing.rounds,
                      sent_kb_s(message_bytes, policy_hz)]  # fmt: skip
-        its = zip(result.worlds, result.costs.tolist(), strict=True)
-        rows += [[*of_timing, world, *costs] for world, costs in its]
+        by_world = zip(result.worlds, result.costs.tolist(), strict=True)
+        rows += [[*of_timing, world, *costs] for world, costs in by_world]
     return rows
 
 

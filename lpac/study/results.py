@@ -101,12 +101,12 @@ def _of_condition(
         for method in methods
     }
     costs = {
-        name: np.array([[flight.cost for flight in of_world] for of_world in its]).swapaxes(0, 1)
-        for name, its in flown.items()
+        name: np.array([[flight.cost for flight in draw] for draw in draws]).swapaxes(0, 1)
+        for name, draws in flown.items()
     }
-    best_of_ten = np.array([[flight.lloyd for flight in its] for its in flown[CLAIRVOYANT]]).T
+    best_of_ten = np.array([[flight.lloyd for flight in draw] for draw in flown[CLAIRVOYANT]]).T
     # Baselines start without the robots that are lost later, and so at a higher cost.
-    initial = np.min([its[:, :, 0].min(axis=0) for its in costs.values()], axis=0)
+    initial = np.min([each[:, :, 0].min(axis=0) for each in costs.values()], axis=0)
     return [
         MethodResult(
             method=method,

@@ -52,7 +52,7 @@ _PAIR = Meta(min_length=2, max_length=2, description="[least, greatest]")
 
 
 def require_name(name: str) -> None:
-    """Raises ValueError if `name` is not a FileName."""
+    """Raise ValueError unless `name` is a FileName."""
     require(FileName, name, "name")
 
 

@@ -23,7 +23,7 @@ Indices = npt.NDArray[np.intp]
 
 # Period of an expert's observations, s.
 LOOK_PERIOD_S = 0.5
-# Of the exploring expert, in model units: pitch of its lattice; distance that lowers an unseen
+# The exploring expert's, in model units: pitch of its lattice; distance that lowers an unseen
 # cell's weight to 1/e; distance of the goal if all unseen cells are in one direction. In eight
 # training worlds of the field it ended at 0.256 of the initial cost (clairvoyant 0.263), and had
 # 0.32 after 20 s (0.56 with a decay of 32). A decay of 12 left distant areas unexplored (0.39).
@@ -109,8 +109,8 @@ class _Clairvoyant:
 class _Centroids(_Clairvoyant):
     """ClairvoyantCVT's centroids, on a coarser raster.
 
-    A third of the time for ten robots in 512 x 512. A test bounds the mean difference from the fine
-    raster's centroids by 0.2 model units, and that of the final cost by 1 %.
+    It takes a third of the time for ten robots in 512 x 512. A test bounds the mean difference from
+    the fine raster's centroids by 0.2 model units, and that of the final cost by 1 %.
     """
 
     def __init__(self, importance: F32) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # processes that fly do not import torch
 
     from lpac.train.task import Task
 
-# By name, of R robots: (R, ...), float16 or float32.
+# Inputs of R robots by name, (R, ...), float16 or float32.
 Inputs = Mapping[str, npt.NDArray[np.floating]]
 # Weights of a torch module, by name.
 StateDict = Mapping[str, "torch.Tensor"]

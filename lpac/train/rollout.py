@@ -249,8 +249,8 @@ class _MixedAgents:
         for i, agent in enumerate(robots):
             if self._by_expert[self._world_of[agent]]:
                 by_expert.setdefault(self._world_of[agent], []).append(i)
-        for world, its in by_expert.items():
-            velocities[its] = self._imitated(world, [self._robot_of[robots[i]] for i in its])
+        for world, own in by_expert.items():
+            velocities[own] = self._imitated(world, [self._robot_of[robots[i]] for i in own])
         return PolicySteps(velocities, payloads_out)
 
     def reset(self, robot: int) -> None:

@@ -108,7 +108,7 @@ class Selection:
 
     @property
     def judged(self) -> list[JudgedCandidate]:
-        """In the order of training."""
+        """Evaluated candidates, in the order of training."""
         return sorted(
             JudgedCandidate(Candidate(*line["candidate"]), ClosedLoopCost(*line["cost"]))
             for line in self._kept.lines

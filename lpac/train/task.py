@@ -58,7 +58,7 @@ class Task(Protocol):
 
 
 CLAIRVOYANT: BaselineName = "clairvoyant-cvt"
-# In addition to the clairvoyant one.
+# Baselines in addition to the clairvoyant one.
 BASELINES: tuple[BaselineName, ...] = ("decentralized-cvt", "decentralized-cvt-prior")
 
 
