@@ -18,15 +18,13 @@ def export(
     checkpoint: Annotated[
         Path,
         typer.Argument(
-            callback=existing,
-            help="LPAC state dict (.pt), or the authors' folder of tensors.",
+            callback=existing, help="LPAC state dict (.pt), or the authors' folder of tensors."
         ),
     ],
     params: Annotated[
         Path,
         typer.Option(
-            callback=existing,
-            help="Our parameter file (TOML), or a coverage_control_params.toml.",
+            callback=existing, help="Our parameter file (TOML), or coverage_control_params.toml."
         ),
     ],
     output: Annotated[
@@ -39,8 +37,7 @@ def export(
     cnn: Annotated[
         Path | None,
         typer.Option(
-            callback=existing,
-            help="State dict whose CNN is used, for example with the authors' folder.",
+            callback=existing, help="State dict whose CNN is used, such as for the authors' folder."
         ),
     ] = None,
     force: Annotated[

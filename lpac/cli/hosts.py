@@ -19,9 +19,7 @@ _FORGET_EVERY_S = 60.0
 @app.command()
 def hosts(
     *,
-    count: Annotated[
-        int, typer.Option("--hosts", "-n", help="Number of computers, with spares.")
-    ] = 3,
+    count: Annotated[int, typer.Option("--hosts", "-n", help="Computers, including spares.")] = 3,
     spares: Annotated[int, typer.Option(help="Number of them without a slot.")] = 0,
     image: Annotated[Path, typer.Option(help="Image from `make image ARCH=amd64`.")] = Path(
         "out/image/amd64"
