@@ -2201,7 +2201,7 @@ def test_late_telemetry_changes_no_outcome() -> None:
 
 def test_the_page_for_people_has_the_same_table() -> None:
     page = FAULTS_PAGE.read_text().splitlines()
-    start = page.index("| From | To | When | The operator reads, for example |") + 2
+    start = page.index("| From | To | When |") + 2
     rows = page[start : page.index("", start)]
     expected = table()
     for row, wanted in zip(rows, expected, strict=False):
@@ -2261,7 +2261,7 @@ def table() -> list[str]:
     """The machine as rows of Markdown, in the order of `TRANSITIONS`.
 
     From, to, when, and an example of what the operator reads, from the scenarios, with numbers as
-    "…": empty if `when` has these words, or the row above them. The states of which all four appear
+    "…"; none if `when` has these words, or the row above. The states of which all four appear
     together are "flying".
     """
     rows, above = [], ""
@@ -2271,9 +2271,9 @@ def table() -> list[str]:
         sources = "any" if everywhere else ", ".join(state.name for state in row.sources)
         sources = sources.replace("TAKEOFF, HOLD, MISSION, RETURN", "flying")
         said = min(reasons[row.when, row.target])
-        shown = "" if said in row.when or said == above else said
+        shown = "" if said in row.when or said == above else f": *{said}*"
         above = said
-        rows.append(f"| {sources} | {row.target.name} | {row.when} | {shown} |")
+        rows.append(f"| {sources} | {row.target.name} | {row.when}{shown} |")
     return rows
 
 
