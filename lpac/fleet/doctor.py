@@ -117,6 +117,10 @@ class Diagnosis(NamedTuple):
         """Checks that keep it from flying."""
         return [check for check in self.checks if check.verdict == "FAILED"]
 
+    def reasons(self) -> list[str]:
+        """Reasons against flying, in words; [] is a go."""
+        return [f"{check.name}: {check.found}" for check in self.failed()]
+
 
 def diagnose(config: FleetConfig, outcomes: Sequence[Outcome[Examination]]) -> list[Diagnosis]:
     """Check all robots; one that did not answer has a single failed check, "reach"."""

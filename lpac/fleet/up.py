@@ -41,14 +41,6 @@ class UpResult(NamedTuple):
     problems: tuple[str, ...]
 
 
-class GoDecision(NamedTuple):
-    """Whether a robot may fly as far as the doctor can tell, and the reasons against it."""
-
-    robot: str
-    go: bool
-    reasons: tuple[str, ...]
-
-
 class BatteryReport(NamedTuple):
     """A robot's battery: its charge (0 to 1) and the trials that it lasts for; None if unknown.
 
@@ -281,11 +273,3 @@ def trials(
     until = max(min_battery, returns_at + mission_s / endurance_s)
     each_s = mission_s + down_s - parameters.reserve_s
     return max(math.floor((share - until) * endurance_s / each_s) + 1, 0)
-
-
-def decide(diagnosis: Diagnosis) -> GoDecision:
-    """Go if no check failed."""
-    failed = diagnosis.failed()
-    return GoDecision(
-        diagnosis.robot, not failed, tuple(f"{check.name}: {check.found}" for check in failed)
-    )

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
     from lpac.fleet.settings import FleetConfig, RobotHost
-    from lpac.fleet.up import BatteryReport, GoDecision, UpResult
+    from lpac.fleet.up import BatteryReport, UpResult
 
 _STYLES = {"ok": GOOD, "skipped": FAINT, "warning": NOTABLE, "FAILED": BAD}
 
@@ -154,7 +154,7 @@ def up(
 
     All robots that have a slot, unless --robots is given. No robot takes off.
     """
-    from lpac.fleet.up import batteries_of, combine_checks, decide
+    from lpac.fleet.up import batteries_of, combine_checks
 
     config, chosen = open_fleet(of.fleet, of.robots)
     until_s = time.monotonic() + timeout
@@ -165,20 +165,20 @@ def up(
     examinations = _examine(config, came)
     diagnoses = combine_checks(config, results, examinations)
     batteries = {pack.robot: pack for pack in batteries_of(config, examinations, trial)}
-    decisions = [decide(diagnosis) for diagnosis in diagnoses]
     if of.as_json:
         described = _described(diagnoses)
-        for decision in decisions:
-            described[decision.robot] |= {"go": decision.go, "reasons": decision.reasons}
+        for diagnosis in diagnoses:
+            reasons = diagnosis.reasons()
+            described[diagnosis.robot] |= {"go": not reasons, "reasons": reasons}
         for pack in batteries.values():
             described[pack.robot]["pack"] = pack._asdict()
         _echo(config, described)
     else:
         _print_found(config, diagnoses)
         _print_multicast(config)
-        _print_decisions(decisions, batteries)
+        _print_decisions(diagnoses, batteries)
         _print_remarks(config, trial)
-    no_go = [decision.robot for decision in decisions if not decision.go]
+    no_go = [diagnosis.robot for diagnosis in diagnoses if diagnosis.failed()]
     if no_go:
         raise ValueError(f"NO-GO: {', '.join(no_go)}")
 
@@ -209,21 +209,21 @@ def _bring_up(
 
 
 def _print_decisions(
-    decisions: "Sequence[GoDecision]", batteries: "Mapping[str, BatteryReport]"
+    diagnoses: "Sequence[Diagnosis]", batteries: "Mapping[str, BatteryReport]"
 ) -> None:
     rows: list[tuple[str | Text, ...]] = []
-    for decision in decisions:
-        word = styled("GO", GOOD) if decision.go else styled("NO-GO", BAD)
-        reasons = decision.reasons or ("",)
-        pack = batteries.get(decision.robot)
+    for diagnosis in diagnoses:
+        first, *others = diagnosis.reasons() or [""]
+        word = styled("NO-GO", BAD) if first else styled("GO", GOOD)
+        pack = batteries.get(diagnosis.robot)
         battery = "" if pack is None or pack.share is None else f"{pack.share:.0%}"
         count = "" if pack is None or pack.trials is None else str(pack.trials)
-        rows.append((decision.robot, word, battery, count, reasons[0]))
-        rows += [("", "", "", "", reason) for reason in reasons[1:]]
-    all_go = all(decision.go for decision in decisions)
+        rows.append((diagnosis.robot, word, battery, count, first))
+        rows += [("", "", "", "", reason) for reason in others]
+    no_go = any(diagnosis.failed() for diagnosis in diagnoses)
     known = [p.trials for p in batteries.values() if p.trials is not None]
     least = str(min(known)) if known else ""
-    go = styled("GO", GOOD) if all_go else styled("NO-GO", BAD)
+    go = styled("NO-GO", BAD) if no_go else styled("GO", GOOD)
     rows.append(("fleet", go, "", least, ""))
     typer.echo()
     print_table(("robot", "", "battery", "trials", "why"), rows, ("battery", "trials"))

@@ -5,6 +5,7 @@ One event loop follows the ground and sends updates to each page. Coverage is co
 
 import asyncio
 import contextlib
+import dataclasses
 import json
 import ssl
 import time
@@ -368,23 +369,16 @@ async def _write(stream: web.WebSocketResponse, page: Outbox) -> None:
             await stream.send_str(text)
 
 
-def _text(view: Json) -> str:
-    return json.dumps(view, separators=(",", ":"), allow_nan=False)
-
-
 def _event_view(event: GroundEvent) -> Json:
-    return {
-        "kind": "event",
-        "unix_time_s": event.unix_time_s,
-        "what": event.kind,
-        "robot": event.robot,
-        "text": event.text,
-        "operator": event.operator,
-    }
+    return {**dataclasses.asdict(event), "kind": "event", "what": event.kind}
 
 
 def _explored_view(explored: Explored) -> Json:
-    return {"kind": "explored", "robot": explored.robot, "cells": explored.cells}
+    return {"kind": "explored", **dataclasses.asdict(explored)}
+
+
+def _text(view: Json) -> str:
+    return json.dumps(view, separators=(",", ":"), allow_nan=False)
 
 
 def _cookie(request: web.Request) -> str:

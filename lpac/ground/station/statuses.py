@@ -58,10 +58,6 @@ class _ProgramStart:
             self.arrivals = _arrivals([each for each in counts if each is not None])
         return True
 
-    def recent(self) -> list[_Received]:
-        newest_at_s = self.newest.at_s
-        return [r for r in self.received if newest_at_s - r.at_s <= _RATE_WINDOW_S]
-
 
 class _Robot:
     """One robot. Of two programs, the first counts until it falls silent."""
@@ -113,12 +109,13 @@ class _Robot:
         program = self.program
         if program is None:
             return RobotSnapshot(self.name, self.robot_id)
-        recent, newest = program.recent(), program.newest.status
+        at_s, _, newest = program.newest
+        recent = [r for r in program.received if at_s - r.at_s <= _RATE_WINDOW_S]
         return RobotSnapshot(
             name=self.name,
             robot_id=self.robot_id,
             status=newest,
-            age_s=now_s - program.newest.at_s,
+            age_s=now_s - at_s,
             # The least delayed status has the best estimate: delay makes a clock look slow.
             clock_offset_s=max(received.clock_ahead_s for received in recent),
             rates_hz=_rates_hz(recent[0].status, newest),

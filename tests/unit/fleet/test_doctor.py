@@ -31,7 +31,7 @@ from lpac.fleet.laptop import rsync_version
 from lpac.fleet.members import init, open_authority
 from lpac.fleet.operations import Outcome
 from lpac.fleet.settings import FleetConfig, RadioConfig, RobotHost, SshConfig, load_fleet
-from lpac.fleet.up import batteries_of, decide
+from lpac.fleet.up import batteries_of
 from lpac.fleet.writer import robot_toml
 from tests.conftest import ROOT
 from tests.host.fleet.field import SILENT
@@ -147,7 +147,7 @@ def says(*checks: dict[str, Any]) -> Any:
 def test_a_robot_that_is_well_may_fly(config: FleetConfig) -> None:
     checks = judged(config)
     assert {check.verdict for check in checks.values()} == {"ok"}
-    assert decide(Diagnosis("r1", tuple(checks.values()))) == ("r1", True, ())
+    assert Diagnosis("r1", tuple(checks.values())).reasons() == []
 
 
 def test_up_says_how_many_trials_the_packs_are_good_for(config: FleetConfig) -> None:
@@ -180,7 +180,7 @@ def test_an_accuracy_that_is_too_bad_for_the_landing_points_is_no_go(config: Fle
     told = [failed(_C.LANDINGS_TOO_NEAR, line)]
     checks = judged(config, put("service.status.failed_checks", told))
     assert checks["preflight"] == ("preflight", "FAILED", line, "do what each line says")
-    assert not decide(Diagnosis("r1", tuple(checks.values()))).go
+    assert Diagnosis("r1", tuple(checks.values())).reasons() == [f"preflight: {line}"]
 
 
 @pytest.mark.parametrize(
