@@ -33,7 +33,7 @@ MAX_CLOCK_OFFSET_S = 0.5
 GOOD_CLOCK_OFFSET_S = 0.05
 _EXCHANGES = 5
 _PINGS = 10
-# Time for the program's first checks after its start, and the failed checks that mean that they
+# Time for the program's first checks after its start, and the failed checks that show that these
 # are not done yet.
 _CHECKS_WAIT_S = 8.0
 _NOT_SETTLED = {CheckCode.CHECKS_RUNNING.value, CheckCode.FAILSAFE_NOT_READ.value}

@@ -49,7 +49,7 @@ _ADVICE = (
     (r"Permission denied", "it refuses the login: run `lpac fleet enroll`, or check your key"),
     (r"Could not resolve", "its host name is not known"),
     (r"Connection refused", "nothing listens on its ssh port"),
-    # Before the next: rsync also reports a closed connection then.
+    # Before the next pattern: rsync reports a closed connection too when the disk is full.
     (r"No space left", "its disk is full"),
     (r"No route to host|timed out|Network is unreachable|not responding|Connection closed|"
      r"Connection reset|Broken pipe|connection unexpectedly closed|timeout in data send/receive",

@@ -73,7 +73,7 @@ def _busy_share(before: Interface, after: Interface) -> float | None:
 
 
 class BulkStream:
-    """Bytes received of a bulk stream."""
+    """Bytes received from a bulk stream, and their rate."""
 
     def __init__(self, robot: str) -> None:
         self.robot = robot

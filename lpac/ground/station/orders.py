@@ -6,7 +6,8 @@ from edge.messages.codes import Refusal, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, Order, OrderKind, OrderResult, RobotStatus
 from lpac.ground.station.statuses import RobotStatuses
 
-# A robot refuses an order that expires beyond the lifetime, or not after the last one it obeyed.
+# A robot refuses an order that expires later than the lifetime allows, or no later than the last
+# order that it obeyed.
 _EXPIRY_MARGIN_S = 0.5
 _LATER_S = 1e-3
 _RESULTS_KEPT = 1000
@@ -48,7 +49,7 @@ class Orders:
         return order.order_id
 
     def _new(self, kind: OrderKind, status: RobotStatus, age_s: float, trial: str) -> Order:
-        """Order for the program of a status of that age. Its uptime went on meanwhile."""
+        """Order for the program that sent this status; its uptime has grown by `age_s` since."""
         self._made += 1
         program = status.robot_id, status.boot_nonce
         expiry_s = max(

@@ -89,7 +89,7 @@ class SetPlaces:
 
 @dataclass(frozen=True, slots=True)
 class Enable:
-    """Let robots run their checks and fly; with `on` False no longer: those in flight hold."""
+    """Let robots run their checks and fly. With `on` False they may not; those in flight hold."""
 
     on: bool = True
     robots: tuple[str, ...] = ()
@@ -99,7 +99,7 @@ class Enable:
 class Takeoff(Bounded):
     """Take off one after another, `interval_s` apart, the highest first.
 
-    Done when all are at their heights. With `abort_on_failure` a failure cancels the remaining.
+    Done when all are at their heights. With `abort_on_failure`, a failure cancels later takeoffs.
     """
 
     robots: tuple[str, ...] = ()

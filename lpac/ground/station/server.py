@@ -169,7 +169,7 @@ class GroundProcess:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Warn once if what the next start restores cannot be written."""
+        """Warn once if the files that the next start restores cannot be written."""
         try:
             yield
         except OSError as error:

@@ -44,8 +44,8 @@ _RECENT_S = 10.0
 _EVENTS_KEPT = 200
 # Minimum time to repeat a hold that all robots obey but the commander's state does not include.
 _ASKED_AT_LEAST_S = 3.0
-# Age of the last state that a robot heard, its status's included: beyond the first it has missed
-# one, beyond the second it is out of reach.
+# Limits of the age of the last state that a robot heard, with the age of the status that reports
+# it. Beyond the first the robot has missed a state, beyond the second it is out of reach.
 _LATE_S, _LOST_S = 1.0, 5.0
 
 
@@ -79,7 +79,7 @@ class Station:
         self._asked: Hold | None = None
         self._asked_at_s = -math.inf
         self._missions = MissionTracker()
-        # The last mission's trial and Unix start time; None: it began before the robot was heard.
+        # The last mission's trial and Unix start time, None if it began before its robot was heard.
         self._mission: tuple[str, float | None] = "", None
         self._events: deque[GroundEvent] = deque(maxlen=_EVENTS_KEPT)
         self._new_events: list[GroundEvent] = []
@@ -115,7 +115,7 @@ class Station:
         setup, state = self._setup, self.state
         world = self.worlds.fleet_id(None if state is None else state.world_id)
         if world != setup.world_id:
-            # No text rather than that of another world.
+            # Better no text than that of another world.
             setup = replace(setup, world=self.worlds.text(world), world_id=world)
         return with_places(setup, {} if state is None else state.places, self._robots.names)
 
@@ -129,7 +129,7 @@ class Station:
         return self._robots.status(self._setup.robots[name])
 
     def recent_status(self, name: str) -> RobotStatus | None:
-        """The robot's newest status, if it is not older than 10 s, so that bad links count."""
+        """The robot's newest status, if it is not older than 10 s: links may be bad."""
         last = self._robots.last(self._setup.robots[name])
         return last[0] if last is not None and last[1] <= _RECENT_S else None
 
