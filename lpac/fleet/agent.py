@@ -194,8 +194,8 @@ def armed(mavlink_port: int) -> bool:
 def receive_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Result:
     """Receive the first autopilot `heartbeat` at this host's UDP port; None after `wait_s`.
 
-    `sender` is its source address and port. One from another computer counts only if none came
-    from this one. A packet socket is used, so the port's owner is not disturbed.
+    `sender` is its source address and port. A heartbeat from another computer counts only if none
+    came from this one. A packet socket is used, so the port's owner is not disturbed.
     """
     received = None
     kind = socket.SOCK_DGRAM  # IP packets, without link-layer headers

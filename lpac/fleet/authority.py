@@ -171,7 +171,7 @@ class Authority:
     def _write(self, members: tuple[Member, ...], *, renew_group_key: bool = True) -> None:
         now = self.members
         later = replace(now, number=now.number + 1, members=members)
-        # Before the list: after it, a repeat would find no robot removed.
+        # Before the list is written: if this failed after it, a repeat would find no robot removed.
         if renew_group_key and _robot_keys(now) - _robot_keys(later):
             self._renew_group_key()
         write_file(self.folder / MEMBERS, later.text.encode(), 0o644)

@@ -47,9 +47,9 @@ class Held(NamedTuple):
 async def overview(session: Session, config: FleetConfig) -> dict[str, Any]:
     """State of the robot: identity, releases, versions, unit and clock.
 
-    `releases` maps numbers, the newest first, to `id`, `image`, and `starts` (it has a program to
-    start). `current`, `earlier` (the target of a rollback) and `pending` (a switch that is not
-    confirmed) are ids. `number` is the current release's.
+    `releases` maps numbers, the newest first, to `id`, `image`, and `starts` (whether it has a
+    program to start). `current`, `earlier` (the target of a rollback) and `pending` (a switch that
+    is not confirmed) are ids. `number` is the current release's.
     """
     prefix = f"cd {config.directory} || cd /; "
     output = await session.capture({name: prefix + text for name, text in _OVERVIEW.items()})

@@ -22,8 +22,8 @@ from lpac.fleet.program import require_disarmed, restart
 from lpac.fleet.session import RemoteError, Session
 from lpac.fleet.settings import FleetConfig, RobotHost
 
-# Read by `edge.drivers.identity_folder`, below /var/lib/lpac. The host's path is as systemd has it
-# for a unit with DynamicUser=.
+# The host's path for a unit with DynamicUser=; the robot's program finds it below /var/lib/lpac
+# (`edge.drivers.identity_folder`).
 _IDENTITY = "/var/lib/private/lpac/identity"
 _NEXT_KEY, _NEXT_CERTIFICATE = "next-key.pem", "next-certificate.pem"
 
@@ -183,7 +183,7 @@ chown -R --no-dereference --reference=.. .; openssl pkey -in {key} -pubout""")  
 
 async def _digests(session: Session) -> dict[str, str]:
     """Hex sha256 of each file of the robot's identity, by name. Raises as `check_output`."""
-    # Without files that the program may replace meanwhile.
+    # Not of files that the program itself may replace meanwhile.
     named = f"-name '*.pem' -o -name {MEMBERS} -o -name {GROUP_KEYS}"
     find = f"find {_IDENTITY} -type f '(' {named} ')' -exec sha256sum {{}} +"
     output = await session.check_output("sh", "-c", f"[ ! -d {_IDENTITY} ] || {find}")

@@ -344,7 +344,7 @@ class ScriptRun:
     def fly(self) -> Procedure[None]:
         """Run all steps of all trials. Raises ScriptError.
 
-        Robots in flight then fly on: call `hold`, also after a KeyboardInterrupt.
+        After an error, robots in flight fly on: call `hold`, also after a KeyboardInterrupt.
         """
         script = self._script
         for i, step in enumerate(script.before):

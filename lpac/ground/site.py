@@ -217,7 +217,7 @@ class Pads(NamedTuple):
 
 
 def pads_in_use(sites: "Sites", name: str, setup: FleetSetup, origin: Origin) -> Pads:
-    """The pads of a site; if `name` is "", of the last site, while its origin is the fleet's.
+    """The pads of the site `name`; if "", of the site used last, if its origin is the fleet's.
 
     Otherwise fleet.toml's pads. Raises ValueError if the named site has another origin.
     """
