@@ -211,16 +211,25 @@ def flies(engine: EngineName, fault: Fault) -> bool:
     return supports(INJECTIONS[engine], fault)
 
 
-def _require_fault(engine: EngineName, scenario: Scenario) -> None:
-    name = scenario.fault
-    if name and scenario.robots < 2:
-        raise ValueError(f"robots = {scenario.robots}: must be at least 2 for a fault")
-    if name and name not in FAULTS:
-        raise ValueError(f"fault = {name}: no such fault: choose one of `lpac drill --list`")
-    if name and not flies(engine, FAULTS[name]):
+def require_faults(engine: EngineName, names: Sequence[str], where: str) -> None:
+    """Raise ValueError, which begins with `where`, unless the engine flies all these faults."""
+    for name in names:
+        if name not in FAULTS:
+            raise ValueError(f"{where} {name}: no such fault; `lpac drill --list` shows all")
+    others = [name for name in names if not flies(engine, FAULTS[name])]
+    if others:
         raise ValueError(
-            f"fault = {name}: is not flown with {engine}: choose one of `lpac drill --list`"
+            f"{where} {', '.join(others)}: {engine} cannot do it; `lpac drill --list` shows which "
+            "engines can"
         )
+
+
+def _require_fault(engine: EngineName, scenario: Scenario) -> None:
+    if not scenario.fault:
+        return
+    if scenario.robots < 2:
+        raise ValueError(f"robots = {scenario.robots}: must be at least 2 for a fault")
+    require_faults(engine, (scenario.fault,), "fault =")
 
 
 def fly(

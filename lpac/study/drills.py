@@ -22,7 +22,7 @@ from lpac.sim.cores import Pool, in_this_process, over_processes
 from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.field import scenario_of
 from lpac.sim.drill.outcome import FlightOutcome, outcome_of
-from lpac.sim.engines import flies
+from lpac.sim.engines import flies, require_faults
 from lpac.sim.scenario import WORLD_SENSOR
 from lpac.sim.sitl.build import require_build
 from lpac.study.flights import FlightGroup, KeptFlights, PlannedFlight, require_planned
@@ -86,17 +86,9 @@ class Drill(Bounded):
 
 
 def faults_of(names: Sequence[str], engine: DrillEngine, where: str = "") -> list[Fault]:
-    """The named faults, or all that the engine can do. Raises ValueError for an unknown one."""
-    for name in names:
-        if name not in FAULTS:
-            raise ValueError(f"{where} {name}: no such fault; `lpac drill --list` shows all")
-    flown = [fault for fault in map(FAULTS.__getitem__, names or FAULTS) if flies(engine, fault)]
-    if names and len(flown) < len(names):
-        others = ", ".join(name for name in names if FAULTS[name] not in flown)
-        raise ValueError(
-            f"{where} {others}: {engine} cannot do it; `lpac drill --list` shows which engines can"
-        )
-    return flown
+    """The named faults, or all that the engine flies. Raises ValueError as `require_faults`."""
+    require_faults(engine, names, where)
+    return [fault for fault in map(FAULTS.__getitem__, names or FAULTS) if flies(engine, fault)]
 
 
 def read_drill(path: Path) -> Drill:

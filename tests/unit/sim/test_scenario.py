@@ -59,7 +59,7 @@ def test_whole_robots_fly_as_they_do_in_the_field(scenario: Scenario, named: str
         ("simulated", Scenario(fault="landed", robots=1), "robots = 1: must be at least 2"),
         ("point", Scenario(fault="landed"), "fault = landed: must be '' for points"),
         ("simulated", Scenario(fault="nothing"), "fault = nothing: no such fault"),
-        ("mavlink", Scenario(fault="radio-dies"), "fault = radio-dies: is not flown with mavlink"),
+        ("mavlink", Scenario(fault="radio-dies"), "fault = radio-dies: mavlink cannot do it"),
         ("nonsense", Scenario(), "engine = 'nonsense': allowed are 'point', 'simulated'"),
         ("px4", Scenario(), "engine = 'px4': needs PX4's build folder"),
     ],
