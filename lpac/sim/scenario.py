@@ -160,7 +160,7 @@ class Scenario(Bounded):
 
     @property
     def input_age_s(self) -> float:
-        """How long images and actions are valid, s."""
+        """Validity of images and actions, s."""
         if self.max_input_age_s is not None:
             return self.max_input_age_s
         return max(_INPUT_AGE_S, 2.0 * self.clocks.perception_s, 2.0 * self.clocks.policy_s)

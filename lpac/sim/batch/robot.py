@@ -200,7 +200,7 @@ class BatchedRobot:
 
     @property
     def payload(self) -> PayloadType:
-        """How its messages' payloads are encoded."""
+        """Number type of its messages' payloads."""
         return self._parameters.payload
 
     def perceive(self, now_s: float) -> None:

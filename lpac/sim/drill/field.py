@@ -118,18 +118,18 @@ class FaultyFleet(ABC):
 
     @abstractmethod
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """True tracks of the vehicles so far, in the world's frame."""
+        """True tracks of the vehicles until now, in the world's frame."""
 
     def highest_m(self) -> float:
         """The height of the robot that flies highest."""
         return max(map(self.height_m, range(len(self.robots_by_name))))
 
     def lead_s(self, injection: Injection) -> float:
-        """How much earlier it has to be injected to take effect in time, s."""
+        """Delay from the injection to its effect, by which it is injected earlier, s."""
         return 0.0
 
     def late_s(self) -> float:
-        """How far this machine was behind real time, s."""
+        """Lateness of this machine behind real time, s."""
         return 0.0
 
     def happen(self, do: Do, hit: tuple[int, ...]) -> None:

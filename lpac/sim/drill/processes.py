@@ -216,7 +216,7 @@ class ProcessField(FaultyFleet):
 
     @abstractmethod
     def vehicles_late_s(self, began_s: float) -> float:
-        """How far the vehicles fell behind since then (`time.monotonic()`), s."""
+        """Lateness of the vehicles since `began_s` (`time.monotonic()`), s."""
 
     def _inject_program(self, injection: Injection, index: int) -> None:
         robot = self.fleet.robots[index]

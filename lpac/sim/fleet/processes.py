@@ -36,7 +36,7 @@ class SimulatedFleetError(ValueError):
 
 
 class Backlog(NamedTuple):
-    """How far a machine is behind real time, s.
+    """Lateness of a machine behind real time, s.
 
     `vehicles_s` is the vehicles' lateness, `robots_s` the time of the control ticks that the median
     robot has skipped.
@@ -63,7 +63,7 @@ class OverloadError(RuntimeError):
 
 
 class Usage(NamedTuple):
-    """Resources of a process so far: CPU time, s, and peak resident memory, MB."""
+    """Resources that a process has used: CPU time, s, and peak resident memory, MB."""
 
     cpu_s: float
     peak_memory_mb: float
@@ -98,7 +98,7 @@ class RobotProcess(LpacProgram):
                 os.kill(int(child), signal.SIGKILL)
 
     def usage(self) -> Usage:
-        """Resources used so far; zero if the program has ended."""
+        """Resources used since the start; zero if the program has ended."""
         return process_usage(self.pid) if self.running else Usage(0.0, 0.0)
 
     def logs(self) -> list[Path]:
@@ -111,7 +111,7 @@ class RobotProcess(LpacProgram):
 
 
 def process_usage(pid: int) -> Usage:
-    """Resources of a process so far."""
+    """Resources that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     ticks = int(fields[11]) + int(fields[12])
     status = Path(f"/proc/{pid}/status").read_text()

@@ -38,7 +38,7 @@ class Vehicles(Protocol):
         """Raise VehicleError if a vehicle has ended."""
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """Tracks of the vehicles so far, one each.
+        """Tracks of the vehicles until now, one each.
 
         Times are `time.monotonic()`, positions north, east, down from the world's origin, m.
         """
@@ -104,7 +104,7 @@ class SimulatedVehicles:
         """Do nothing: they end with this process."""
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """Tracks of the vehicles so far, all at the same times."""
+        """Tracks of the vehicles until now, all at the same times."""
         with self.stepped:
             truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
         started_s = self._server.started_s

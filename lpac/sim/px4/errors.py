@@ -161,7 +161,7 @@ class Errors:
         return accuracy_m, GPS_VERTICAL * accuracy_m
 
     def satellites(self, time_s: float) -> int:
-        """How many satellites the receiver sees."""
+        """Number of satellites that the receiver sees."""
         least, greatest = SATELLITES
         return least + round((greatest - least) * self._share_of_sky(time_s))
 

@@ -378,7 +378,7 @@ class Px4Vehicle:
         return self.estimator.position_valid
 
     def silent_s(self, sensor: SimulatedSensor) -> float:
-        """How long a sensor's driver has been dead, s; below 0 if it is not."""
+        """Time since a sensor's driver died, s; below 0 while it runs."""
         return self.time_s - self._dead_since_s.get(sensor, math.inf)
 
     @property

@@ -105,7 +105,7 @@ class _Instance:
         return sorted(path for path in found if path.stat().st_mtime >= self.started_unix_s)
 
     def ending(self) -> str:
-        """How PX4 has ended, and its last line of output."""
+        """Signal or exit code of the ended PX4, and its last line of output."""
         assert self.process is not None and self.process.returncode is not None
         code = self.process.returncode
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
@@ -228,7 +228,7 @@ class Px4Build:
         return max(0.0, *lost_s, 0.0)
 
     def stood_still_s(self, since_s: float) -> float:
-        """Longest standstill of a PX4's clock since then (`time.monotonic()`), s."""
+        """Longest standstill of a PX4's clock after `since_s` (`time.monotonic()`), s."""
         longest_s = 0.0
         with self._lock:
             for instance in self._instances:

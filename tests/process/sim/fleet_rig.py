@@ -172,8 +172,6 @@ class FleetRig:
         """Wait until the robot is in this state; returns its status."""
         return self.wait_status(robot, lambda status: status.state is state)
 
-    # The vehicles' part
-
     def vehicle(self, robot: int) -> Px4Vehicle:
         """The robot's vehicle."""
         return self.simulated.vehicles[robot]

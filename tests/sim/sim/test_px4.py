@@ -80,9 +80,6 @@ def texts(vehicle: Px4Vehicle) -> list[str]:
     return [event.text.rstrip() for event in vehicle.take_events() if event.text]
 
 
-# Arming
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_arming_is_denied_until_health_is_good(seed: int) -> None:
     vehicle = Px4Vehicle(seed=seed)
@@ -146,9 +143,6 @@ def test_disarming_in_the_air_is_denied_but_a_kill_drops_the_vehicle() -> None:
     assert vehicle.armed
     assert vehicle.disarm(force=True) is MavResult.ACCEPTED
     assert run_until(vehicle, lambda: vehicle.landed, 5.0) < 2.5
-
-
-# Flight
 
 
 def test_take_off_and_landing_take_as_long_as_measured() -> None:
@@ -217,9 +211,6 @@ def test_return_climbs_flies_home_and_lands() -> None:
     assert min(sample.position_m[2] for sample in vehicle.truth) == pytest.approx(-12.0, abs=1.0)
 
 
-# Offboard
-
-
 def test_offboard_needs_a_stream() -> None:
     vehicle = hovering()
     assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.TEMPORARILY_REJECTED
@@ -277,9 +268,6 @@ def test_a_stream_that_comes_back_takes_the_vehicle_along_again() -> None:
     assert mode_of(vehicle) is Px4Mode.HOLD
 
 
-# The pilot
-
-
 def test_a_pilot_takes_over_and_the_client_gets_the_vehicle_back() -> None:
     vehicle = in_offboard(velocity(1.0), rc=True)
     assert vehicle.pilot(Px4Mode.POSCTL, (0.0, -2.0, 0.0)) is MavResult.ACCEPTED
@@ -333,9 +321,6 @@ def test_nobody_takes_a_vehicle_that_listens_to_no_remote_control() -> None:
     assert vehicle.pilot(Px4Mode.POSCTL, (0.0, -2.0, 0.0)) is MavResult.TEMPORARILY_REJECTED
     run(vehicle, 3.0, velocity(1.0))
     assert mode_of(vehicle) is Px4Mode.OFFBOARD
-
-
-# Other failsafes
 
 
 def test_without_gps_it_descends_where_the_wind_takes_it() -> None:
@@ -447,9 +432,6 @@ def test_the_fence_acts_once_on_a_breach(polygon: bool) -> None:
     assert mode_of(vehicle) is Px4Mode.OFFBOARD
 
 
-# Where it is
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_gps_is_wrong_by_one_to_five_metres(seed: int) -> None:
@@ -513,9 +495,6 @@ def test_an_origin_that_moves_in_height_lets_the_vehicle_climb_unseen() -> None:
     home = vehicle.global_home
     assert home is not None
     assert vehicle.global_position[2] - home[2] == pytest.approx(height_m + 6.0, abs=0.7)
-
-
-# MAVLink
 
 
 @given(
