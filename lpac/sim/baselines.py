@@ -1,8 +1,9 @@
 """The baseline controllers: Lloyd's algorithm with several degrees of knowledge.
 
-As in CoverageControl, all robots step at once and know the true positions (decentralised ones:
-those within communication range), whatever happens to messages. Position errors apply to them too.
-None of them is a bound: Lloyd's algorithm ends in local minima, even with full knowledge.
+As in CoverageControl, all robots step at once and know the true positions; decentralised ones know
+those within communication range. They use no messages, so that losses do not affect them, but
+position errors do. None of them is a lower bound of the cost: Lloyd's algorithm ends in local
+minima, even with full knowledge.
 """
 
 import math
@@ -207,7 +208,7 @@ class FrontierCvt(SharedCvt):
 
 
 def connected(positions: F64, communication_range: float) -> list[npt.NDArray[np.intp]]:
-    """The robots (N, 2) that reach each other, directly or through others, each group ascending."""
+    """Groups of robots that reach each other over any number of hops; robots ascend in each."""
     offsets = positions[:, None] - positions
     near = np.hypot(offsets[..., 0], offsets[..., 1]) < communication_range
     count, group_of = scipy.sparse.csgraph.connected_components(near, directed=False)
@@ -215,7 +216,7 @@ def connected(positions: F64, communication_range: float) -> list[npt.NDArray[np
 
 
 def _unseen_points(seen: Bools, origin: tuple[int, int]) -> F64:
-    """(n, 2): centres of unseen cells, of those on the lattice, in model units."""
+    """(n, 2): centres of the unseen cells on the lattice, in model units."""
     # Offset by half a pitch, since that much stays unseen at the world's border.
     first = [(_FRONTIER_PITCH // 2 - start) % _FRONTIER_PITCH for start in origin]
     lattice = seen[first[0] :: _FRONTIER_PITCH, first[1] :: _FRONTIER_PITCH]
@@ -260,7 +261,7 @@ class BaselineSwarm:
         bias_m: F64 | None,
         world_size: int,
     ) -> None:
-        """`bias_m` (N, 2) is the robots' position error; they observe the wrong place accordingly.
+        """`bias_m` (N, 2) is the robots' position error: they sense at the wrong position.
 
         `world_size` is in model units.
         """

@@ -16,20 +16,20 @@ class KeptOutcomes:
     valid ones.
     """
 
-    def __init__(self, path: Path, came_of: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, source: Mapping[str, Any]) -> None:
         """Create or read the file. Raises OSError."""
         self._path = path
         self.lines: list[dict[str, Any]] = []
         path.parent.mkdir(parents=True, exist_ok=True)
         text = path.read_text() if path.exists() else ""
         first, *lines = [*map(_parsed, text.splitlines())] or [None]
-        if first == came_of:
+        if first == source:
             self.lines = [line for line in lines if line is not None]
-        if first == came_of and None not in lines:
+        if first == source and None not in lines:
             return
         # Another version, or a partial last line that the next one would continue.
         new = path.with_name(f"{path.name}.new")
-        new.write_text("".join(json.dumps(line) + "\n" for line in (came_of, *self.lines)))
+        new.write_text("".join(json.dumps(line) + "\n" for line in (source, *self.lines)))
         new.replace(path)
 
     def add(self, line: dict[str, Any]) -> None:

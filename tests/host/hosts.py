@@ -79,7 +79,7 @@ class FrailHost(SimulatedHost):
         self.stop_vehicle()
         with contextlib.suppress(RuntimeError):
             os.kill(self._leader(), signal.SIGKILL)
-        self.ended()
+        self.await_end()
         self._rack.sh('ip -n air link delete "$1"; ip netns delete "$1"', self.name)
 
     def power_on(self) -> None:

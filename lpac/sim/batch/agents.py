@@ -42,8 +42,8 @@ class PolicySteps(NamedTuple):
 class Agents(Protocol):
     """Robots 0..N-1, of one world or of several, under one policy.
 
-    An observation affects later steps by its features alone. So the simulator computes inputs and
-    features only of the observations on which a robot decides.
+    An observation affects later steps by its features alone, so the simulator computes inputs and
+    features only of observations that a step uses.
     """
 
     @property
@@ -51,7 +51,7 @@ class Agents(Protocol):
         """The number of floats in a payload."""
 
     def inputs(self, robot: int, observation: Observation) -> Inputs:
-        """The policy's inputs from an observation, by name: new arrays, the same for all robots."""
+        """New arrays with the policy's inputs from an observation, by the same names for all."""
 
     def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
         """Features of n robots from their inputs. The only thread-safe method."""

@@ -53,8 +53,8 @@ _DESCENT_S = 20.0 / 0.7
 # Without GPS the vehicle cannot hold its position: it drifts with the wind until it is down.
 ADRIFT_M = POSITION_ERROR_M + GREATEST_WIND_M_S * _DESCENT_S
 ADRIFT = "without a position the wind carries it as it comes down, over the fence or onto another"
-# A storm, and the greatest wind besides, carry a vehicle as fast as they blow beyond its airspeed,
-# and until it has stopped: no margin covers that.
+# A storm on top of the greatest wind carries a vehicle by their speed minus its airspeed, until the
+# vehicle has stopped after it. No margin covers that.
 _STORM_M_S, _STORM_S = 16.0, 10.0
 _CARRIED_M_S = _STORM_M_S + GREATEST_WIND_M_S - Airframe().max_airspeed_m_s
 _CARRIED_M = _CARRIED_M_S * (_STORM_S + 2.0)
@@ -64,7 +64,7 @@ _STANDS_AFTER_S = 2.5
 _LANDING_S = 45.0
 # Across the field at full speed, and down.
 _HOME_S = 35.0 + _LANDING_S
-# The distance of landing points, and what it takes to stop in gusts.
+# Distance between landing points, and the stopping distance in gusts.
 _PARTS_M = 8.0 + 3.0
 # The receiver's error walks by up to 0.8 m between takeoff and landing, and gusts displace it.
 _AT_PAD_M = 3.0

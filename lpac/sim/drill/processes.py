@@ -1,7 +1,7 @@
 """Faults in real time: programs of robots and ground station, on simulated vehicles or real PX4s.
 
-Flights are judged by the same bounds as on the simulated clock. The record has how far this machine
-was behind real time.
+Flights are judged by the same bounds as on the simulated clock. The record has the lateness of this
+machine.
 """
 
 import heapq

@@ -161,7 +161,7 @@ class Layout:
         If the scenario's world size or range differs from the bundle's, a bundle with these sizes
         is written to `folder` for the robots.
 
-        `robots` has the entries of each robot in fleet.toml besides its ids, by name, in order.
+        `robots` has each robot's further entries in fleet.toml, by name and in order.
         `settings` are further keys of robot.toml's tables, for all robots. The last `spares` have
         no slot in fleet.toml, but a robot.toml. `keys`: keys of a secure fleet are in `folder`, as
         written by `write_keys`. `radio` is fleet.toml's table of that name.
@@ -193,9 +193,9 @@ class Layout:
                         "host": f"{name}.invalid",
                         "address": "127.0.0.1",
                         "robot_id": robot_id,
-                        **its,
+                        **entries,
                     }
-                    for robot_id, (name, its) in enumerate(robots.items())
+                    for robot_id, (name, entries) in enumerate(robots.items())
                 },
                 "slots": [
                     {

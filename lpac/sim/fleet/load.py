@@ -18,23 +18,23 @@ from lpac.sim.points import fly_points
 from lpac.sim.programs import python_program
 from lpac.sim.scenario import Scenario
 
-# Units of work per second that a robot's program and its vehicle take. A core does 27 a second; a
-# PX4 takes 0.1 to 0.2 of a core, and a robot's program 0.05 to 0.14 besides: two cores run three.
+# Units of work per second that one robot takes, program and vehicle. A core does 27 a second. A
+# PX4 takes 0.1 to 0.2 of a core and a robot's program 0.05 to 0.14, so two cores run three.
 _UNITS_PER_S = {"mavlink": 3.0, "px4": 8.0}
 
-# The rest is for bursts: programs that start, and other load.
+# Share of the cores for robots. The rest is for bursts: programs that start, and other load.
 _SHARE_TO_USE = 0.55
 _ROUNDS = 5
 _ROUND_S = 0.4
 _MAX_WORKERS = 8
-# Two robots that share a process fly for two seconds.
+# One unit of work: two point robots fly for two seconds.
 _UNIT = Scenario(robots=2, duration_s=2.0)
 
 
 def robots_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> float:
     """Number of robots that this machine can fly in real time, under its present load.
 
-    The measurement loads every core that this process may use for two seconds.
+    The measurement takes two seconds, and loads all cores that this process may use.
 
     Raises OSError or BundleError for a bundle that cannot be loaded.
     """

@@ -31,7 +31,7 @@ NEEDED = {
     "rsync": "rsync",
     "ip": "iproute2",
 }
-# Debian has no keys of Ubuntu's.
+# Debian lacks the keys of Ubuntu's archive.
 _KEYRING_URL = (
     f"{MIRRORS[SUITE]}/pool/main/u/ubuntu-keyring/ubuntu-keyring_2018.09.18.1~18.04.2_all.deb"
 )
@@ -118,7 +118,7 @@ def base_tree(report: Callable[[str], None]) -> Path:
 
 
 def _make(suite: str, tree: Path) -> None:
-    """Raises OSError."""
+    """Build the tree of a suite. Raises OSError."""
     with tempfile.TemporaryDirectory(prefix="making-", dir=tree.parent) as name:
         making = Path(name)
         keys = [f"--keyring={_ubuntu_keys(making)}"] if suite == SUITE else []

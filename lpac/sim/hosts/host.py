@@ -150,7 +150,7 @@ class SimulatedHost:
             self._server.__exit__(None, None, None)
             self._server = None
 
-    def ended(self) -> None:
+    def await_end(self) -> None:
         """Wait for the end of the killed system."""
         if self._process is not None:
             self._process.wait()

@@ -75,7 +75,7 @@ class SimulatedHosts:
         shutil.rmtree(self.folder / "keys", ignore_errors=True)
         base = base_tree(self._report)
         with ExitStack() as stack:
-            stack.callback(self._ended)
+            stack.callback(self._await_ends)
             rack = stack.enter_context(Rack(base))
             self.fleet = f"hosts-{rack.number}-{os.getpid()}"
             key = new_key(self.folder / "id_ed25519")
@@ -103,9 +103,9 @@ class SimulatedHosts:
     def __getitem__(self, index: int) -> SimulatedHost:
         return self._hosts[index]
 
-    def _ended(self) -> None:
+    def _await_ends(self) -> None:
         for host in self._hosts:
-            host.ended()
+            host.await_end()
 
     def _write_files(self) -> None:
         world_size = round(FIELD_M * FIELD_SCALE.env_scale)

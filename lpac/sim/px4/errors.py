@@ -20,7 +20,7 @@ SATELLITES = (8, 16)
 # Errors of a fix, which the estimator smooths: noise, and now and then multipath.
 _FIX_WAVES, _FIX_WAVE_M, _FIX_PERIODS_S = 4, 0.2, (2.0, 60.0)
 _ECHOES_M, _ECHO_EVERY_S, _ECHO_FOR_S = (1.0, 3.5), (120.0, 400.0), (3.0, 15.0)
-# Drift of the bias, along its length and across, either way.
+# Drift of the bias: amplitude along it and across it, and periods.
 _WALK_M, _WALK_PERIODS_S = 0.4, (200.0, 700.0)
 
 # Error of the estimated horizontal velocity along each axis: 0.25 m/s rms, 0.6 m/s at most. In

@@ -1,8 +1,8 @@
 """Real PX4s from a SITL build (`make px4_sitl`) with PX4's own vehicle model (SIH), from v1.14 on.
 
 Instance i listens on UDP port 14580 + i, sends to 14540 + i, receives a ground station on
-18570 + i, and sends the vehicle's true state (HIL_STATE_QUATERNION) to 19410 + i. Those beyond the
-tenth would all send to one port. The true flight is read from PX4's log at the end.
+18570 + i, and sends the vehicle's true state (HIL_STATE_QUATERNION) to 19410 + i. From
+instance 10 on they would share one port. The true flight is read from PX4's log at the end.
 """
 
 import fcntl

@@ -154,8 +154,8 @@ class RealVehicle:
     def change_battery(self, remaining: float) -> None:
         """Set the battery of a disarmed vehicle to this share.
 
-        It is an external battery over MAVLink, not for flights: it reports no remaining time, which
-        PX4 takes for none, and returns.
+        The battery is external, over MAVLink, and not for flights: it reports no remaining time,
+        which PX4 takes for 0 s, and returns.
         """
         self.set_parameter("BAT1_SOURCE", _EXTERNAL_BATTERY)
         self._battery = remaining
