@@ -147,7 +147,6 @@ _EACH_SECOND = range(180)
 # Noticed after 3 s at most, and set back at once.
 _SET_BACK_S = 5.0
 _RC = ("failsafe", "rc", "pilot")
-_NOTHING = "nothing happens"
 
 _FAULTS = (
     Fault(

@@ -294,11 +294,6 @@ class Px4Vehicle:
             return self._frozen[0]
         return total(self._position_m, self._shared_error_m(), self.estimator.error_m)
 
-    @property
-    def estimated_velocity_m_s(self) -> F64:
-        """(3,), world frame: estimated velocity."""
-        return np.array(self.estimate_m_s())
-
     def estimate_m_s(self) -> Vector:
         """Estimated velocity as plain floats."""
         if self._frozen is not None:

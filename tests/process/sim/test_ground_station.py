@@ -20,7 +20,7 @@ SYSTEM = INSTANCE + 1
 
 
 class Px4EndOfTheLink:
-    """Says what a PX4 says to a ground station, and hears what comes."""
+    """Send the messages of a PX4 to a ground station, and receive its messages."""
 
     def __init__(self, udp: socket.socket) -> None:
         self.udp = udp
@@ -28,8 +28,8 @@ class Px4EndOfTheLink:
         self.mav.robust_parsing = True
         self.peer: Any = None
 
-    def hear(self) -> list[Any]:
-        """All that has come."""
+    def received(self) -> list[Any]:
+        """All messages since the last call."""
         messages: list[Any] = []
         while True:
             try:
@@ -38,12 +38,12 @@ class Px4EndOfTheLink:
                 return messages
             messages += self.mav.parse_buffer(data) or ()
 
-    def say(self, message: Any) -> None:
+    def send(self, message: Any) -> None:
         self.udp.sendto(message.pack(self.mav), self.peer)
 
     def is_in(self, mode: Px4Mode) -> None:
         main, sub = CUSTOM_MODES[mode]
-        self.say(
+        self.send(
             mavlink.MAVLink_heartbeat_message(
                 mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4,
                 mavlink.MAV_MODE_FLAG_SAFETY_ARMED, main << 16 | sub << 24, 4, 3,
@@ -53,7 +53,7 @@ class Px4EndOfTheLink:
     def is_heading(self, heading_rad: float) -> None:
         half = heading_rad / 2.0
         latitude, longitude, altitude_m = WorldOrigin().to_global(np.zeros(3))
-        self.say(
+        self.send(
             mavlink.MAVLink_hil_state_quaternion_message(
                 0, [math.cos(half), 0.0, 0.0, math.sin(half)], 0.0, 0.0, 0.0,
                 round(latitude * 1e7), round(longitude * 1e7), round(altitude_m * 1e3),
@@ -81,14 +81,14 @@ def channels(sticks: Any) -> tuple[int, ...]:
     return sticks.chan1_raw, sticks.chan2_raw, sticks.chan3_raw, sticks.chan4_raw
 
 
-def test_sticks_are_heard_first_and_the_mode_is_asked_for_until_it_is_so(
+def test_sticks_are_sent_first_and_the_mode_is_commanded_until_it_is_set(
     link: tuple[RealVehicle, Px4EndOfTheLink], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vehicle, px4 = link
     now_s = 100.0
     monkeypatch.setattr("lpac.sim.sitl.ground_station.time.monotonic", lambda: now_s)
     vehicle.exchange()
-    assert not only(px4.hear(), "RC_CHANNELS_OVERRIDE"), "no remote control is on"
+    assert not only(px4.received(), "RC_CHANNELS_OVERRIDE"), "no remote control is on"
     px4.is_in(Px4Mode.OFFBOARD)
     # North is to the left of a nose that points east.
     px4.is_heading(math.pi / 2.0)
@@ -99,35 +99,35 @@ def test_sticks_are_heard_first_and_the_mode_is_asked_for_until_it_is_so(
     for _ in range(10):
         now_s += 0.1
         vehicle.exchange()
-        heard = px4.hear()
-        (sticks,) = only(heard, "RC_CHANNELS_OVERRIDE")
+        messages = px4.received()
+        (sticks,) = only(messages, "RC_CHANNELS_OVERRIDE")
         assert sticks.target_system == SYSTEM
         shares = (np.array(channels(sticks)) - 1500.0) / 500.0
         # PX4 v1.17's own curve, src/lib/sticks/Sticks.hpp.
         assert 0.4 * shares + 0.6 * shares**3 == pytest.approx([-0.5, 0.25, 0.5, 0.0], abs=3e-3)
-        modes = only(heard, "COMMAND_LONG")
+        modes = only(messages, "COMMAND_LONG")
         asked += sum(m.command == mavlink.MAV_CMD_DO_SET_MODE for m in modes)
     assert asked >= 3
     px4.is_in(Px4Mode.POSCTL)
     vehicle.exchange()
     assert vehicle.mode is Px4Mode.POSCTL
-    px4.hear()
+    px4.received()
     vehicle.move_sticks(())
     now_s += 1.0
     vehicle.exchange()
-    heard = px4.hear()
-    (sticks,) = only(heard, "RC_CHANNELS_OVERRIDE")
+    messages = px4.received()
+    (sticks,) = only(messages, "RC_CHANNELS_OVERRIDE")
     assert channels(sticks) == (1500,) * 4
-    commands = [m.command for m in only(heard, "COMMAND_LONG")]
+    commands = [m.command for m in only(messages, "COMMAND_LONG")]
     assert mavlink.MAV_CMD_DO_SET_MODE not in commands
     # Lost, it says nothing more.
     vehicle.rc_connected = False
     now_s += 1.0
     vehicle.exchange()
-    assert not only(px4.hear(), "RC_CHANNELS_OVERRIDE")
+    assert not only(px4.received(), "RC_CHANNELS_OVERRIDE")
 
 
-def test_parameters_are_told_again_until_they_are_confirmed(
+def test_parameters_are_sent_again_until_they_are_confirmed(
     link: tuple[RealVehicle, Px4EndOfTheLink], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vehicle, px4 = link
@@ -137,21 +137,21 @@ def test_parameters_are_told_again_until_they_are_confirmed(
     vehicle.set_parameter("SIM_GPS_USED", 10)
     vehicle.set_parameter("MPC_VEL_MANUAL", 4.1)
     vehicle.exchange()
-    told = {each.param_id: each for each in only(px4.hear(), "PARAM_SET")}
-    assert told.keys() == {"SIM_GPS_USED", "MPC_VEL_MANUAL"}
-    for number, kept in enumerate(told.values()):
+    sent = {each.param_id: each for each in only(px4.received(), "PARAM_SET")}
+    assert sent.keys() == {"SIM_GPS_USED", "MPC_VEL_MANUAL"}
+    for number, kept in enumerate(sent.values()):
         # Of one it says what it had before, which is no confirmation.
         value = kept.param_value if kept.param_id == "SIM_GPS_USED" else 10.0
         name = kept.param_id.encode()
-        px4.say(mavlink.MAVLink_param_value_message(name, value, kept.param_type, 2, number))
+        px4.send(mavlink.MAVLink_param_value_message(name, value, kept.param_type, 2, number))
     vehicle.exchange()
     assert vehicle.unconfirmed == ("MPC_VEL_MANUAL",)
     now_s += 1.0
     vehicle.exchange()
-    (again,) = only(px4.hear(), "PARAM_SET")
-    px4.say(mavlink.MAVLink_param_value_message(b"MPC_VEL_MANUAL", again.param_value, 9, 2, 1))
+    (again,) = only(px4.received(), "PARAM_SET")
+    px4.send(mavlink.MAVLink_param_value_message(b"MPC_VEL_MANUAL", again.param_value, 9, 2, 1))
     vehicle.exchange()
     assert len(vehicle.unconfirmed) == 0
     now_s += 1.0
     vehicle.exchange()
-    assert only(px4.hear(), "PARAM_SET") == []
+    assert only(px4.received(), "PARAM_SET") == []

@@ -1,6 +1,6 @@
-"""What goes wrong with a simulated vehicle's position is judged as docs/faults.md has it.
+"""Position faults of a simulated vehicle are judged as docs/faults.md states.
 
-By what the vehicle tells over its link, and what a robot concludes from it; nothing runs in real
+The vehicle reports over its link, and the judge of a robot decides. Nothing runs in real
 time.
 """
 
@@ -47,7 +47,7 @@ def sets(**fields: Any) -> Callable[[object], None]:
     return do
 
 
-def lies(**fields: Any) -> Callable[[Px4Vehicle], None]:
+def receiver(**fields: Any) -> Callable[[Px4Vehicle], None]:
     def do(vehicle: Px4Vehicle) -> None:
         sets(**fields)(vehicle.receiver)
 
@@ -58,12 +58,12 @@ def jumps(north_m: float) -> Callable[[Px4Vehicle], None]:
     return sets(gps_jump_m=(north_m, 0.0, 0.0))
 
 
-# What is done, why the position is doubted, and after how many seconds: told, and 0.4 s. Then when
-# it is lost, if it is: 2 s after it was told.
+# Fault, cause of the doubt, and seconds until the position is doubted: the report and 0.4 s. Then
+# the seconds until it is lost, 2 s after the report; None if it is not.
 LASTING = [
     pytest.param(sets(gps_lost=True), PositionCause.NO_FIX, 0.8, 2.7, id="no fix"),
     pytest.param(
-        # PX4 says so after a second.
+        # PX4 reports it after a second.
         lambda vehicle: vehicle.dead_sensors.add(SimulatedSensor.GPS), PositionCause.NO_FIX, 2.0,
         3.9,
         id="no driver",
@@ -76,12 +76,12 @@ LASTING = [
         sets(gps_accuracy_override_m=6.0), PositionCause.INACCURATE, 0.8, None, id="inaccurate"
     ),
     pytest.param(jumps(7.0), PositionCause.DISAGREES, 0.8, 2.5, id="jumps"),
-    pytest.param(lies(stuck=True), PositionCause.GPS_STUCK, 1.2, 2.8, id="stuck"),
+    pytest.param(receiver(stuck=True), PositionCause.GPS_STUCK, 1.2, 2.8, id="stuck"),
     pytest.param(
-        lies(creep_m_s=(2.0, 0.0, 0.0)), PositionCause.SLIPS, 3.5, 5.5, id="creeps"
+        receiver(creep_m_s=(2.0, 0.0, 0.0)), PositionCause.SLIPS, 3.5, 5.5, id="creeps"
     ),
     pytest.param(
-        lies(velocity_bias_m_s=(0.0, 3.0, 0.0)), PositionCause.VELOCITY_DISAGREES, 0.8,
+        receiver(velocity_bias_m_s=(0.0, 3.0, 0.0)), PositionCause.VELOCITY_DISAGREES, 0.8,
         # In between the estimate follows it.
         4.3,
         id="wrong velocity",

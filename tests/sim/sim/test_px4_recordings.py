@@ -1,11 +1,11 @@
-"""The simulated PX4 says what a real one said: recordings of a real PX4 v1.17 are replayed.
+"""The simulated PX4 sends what a real one sent: recordings of a real PX4 v1.17 are replayed.
 
-Each recording (tests/data/px4_v1.17, see its README) holds what a robot and its PX4 said to each
+Each recording (tests/data/px4_v1.17, see its README) holds what a robot and its PX4 sent to each
 other. The robot's side goes to a simulated vehicle together with what was done to the vehicle
-meanwhile, and then the words of both are compared: what is told, how often, and when it changes.
+meanwhile, and then the messages of both are compared: contents, rates and times of changes.
 
 All times are PX4's own, s since it started: the machine that it ran on was slow, in jerks, and so
-were the seconds of its README. Nothing here runs in real time. `ON_PURPOSE` says in what the two
+were the seconds of its README. Nothing here runs in real time. `ON_PURPOSE` lists in what the two
 may differ, and why.
 """
 
@@ -42,30 +42,30 @@ UNNAMED = {
 # What the simulated PX4 does otherwise than the real one, and why.
 ON_PURPOSE = {
     # Messages that it does not send: nothing of ours listens.
-    "ALTITUDE": "not heard by anybody",
-    "ATTITUDE_QUATERNION": "not heard by anybody",
-    "ATTITUDE_TARGET": "not heard by anybody",
-    "COMMAND_LONG": "PX4 tells others what it commands itself; not heard by anybody",
-    "CURRENT_MODE": "not heard by anybody: the mode is HEARTBEAT's",
+    "ALTITUDE": "no client reads it",
+    "ATTITUDE_QUATERNION": "no client reads it",
+    "ATTITUDE_TARGET": "no client reads it",
+    "COMMAND_LONG": "what PX4 commands itself; no client reads it",
+    "CURRENT_MODE": "no client reads it: the mode is HEARTBEAT's",
     "DISTANCE_SENSOR": "the simulated vehicle has no range finder",
-    "GNSS_INTEGRITY": "not heard by anybody",
-    "HIGHRES_IMU": "not heard by anybody",
-    "LINK_NODE_STATUS": "not heard by anybody",
-    "MISSION_CURRENT": "not heard by anybody",
-    "OPEN_DRONE_ID_LOCATION": "not heard by anybody",
-    "OPEN_DRONE_ID_SYSTEM": "not heard by anybody",
-    "PING": "not heard by anybody",
-    "POSITION_TARGET_GLOBAL_INT": "not heard by anybody",
-    "POSITION_TARGET_LOCAL_NED": "not heard by anybody",
-    "SCALED_PRESSURE": "not heard by anybody",
-    "SERVO_OUTPUT_RAW": "not heard by anybody",
-    "SYSTEM_TIME": "not heard by anybody",
-    "TIMESYNC": "not heard by anybody",
-    "TIME_ESTIMATE_TO_TARGET": "not heard by anybody",
-    "VIBRATION": "not heard by anybody",
+    "GNSS_INTEGRITY": "no client reads it",
+    "HIGHRES_IMU": "no client reads it",
+    "LINK_NODE_STATUS": "no client reads it",
+    "MISSION_CURRENT": "no client reads it",
+    "OPEN_DRONE_ID_LOCATION": "no client reads it",
+    "OPEN_DRONE_ID_SYSTEM": "no client reads it",
+    "PING": "no client reads it",
+    "POSITION_TARGET_GLOBAL_INT": "no client reads it",
+    "POSITION_TARGET_LOCAL_NED": "no client reads it",
+    "SCALED_PRESSURE": "no client reads it",
+    "SERVO_OUTPUT_RAW": "no client reads it",
+    "SYSTEM_TIME": "no client reads it",
+    "TIMESYNC": "no client reads it",
+    "TIME_ESTIMATE_TO_TARGET": "no client reads it",
+    "VIBRATION": "no client reads it",
     # What it does send, but otherwise.
     "ATTITUDE": "50 Hz instead of 100: the simulated vehicle takes 50 steps a second",
-    "PARAM_VALUE": "PX4 also tells of parameters that it changes itself, as calibrations",
+    "PARAM_VALUE": "PX4 also sends parameters that it changes itself, as calibrations",
     "ESTIMATOR_STATUS POS_VERT_AGL": "the range finder's, which the simulated vehicle lacks",
     "ESTIMATOR_STATUS ACCEL_ERROR": "at the touch of the ground; not read by anybody",
     "height": "it is never lost, as without GPS and barometer (`sensors_die` after 18 s), by then "
@@ -82,7 +82,7 @@ ON_PURPOSE = {
 }
 
 
-class Said(NamedTuple):
+class Stamped(NamedTuple):
     """One message, and when: s of PX4's own clock."""
 
     at_s: float
@@ -102,10 +102,10 @@ class Track:
     period_s: float
     ignored: int = 0
 
-    def values(self, said: list[Said]) -> list[tuple[float, tuple[int, ...]]]:
+    def values(self, messages: list[Stamped]) -> list[tuple[float, tuple[int, ...]]]:
         """The values in turn, each with the time of its first message."""
         changes: list[tuple[float, tuple[int, ...]]] = []
-        for at_s, name, message in said:
+        for at_s, name, message in messages:
             if name == self.message:
                 value = tuple(int(getattr(message, f)) & ~self.ignored for f in self.fields)
                 if not changes or changes[-1][1] != value:
@@ -225,10 +225,10 @@ SCENARIOS = {
 
 @dataclass
 class Replay:
-    """What the real and the simulated vehicle said, and when the phases began."""
+    """Messages of the real and of the simulated vehicle, and the starts of the phases."""
 
-    real: list[Said] = field(default_factory=list)
-    simulated: list[Said] = field(default_factory=list)
+    real: list[Stamped] = field(default_factory=list)
+    simulated: list[Stamped] = field(default_factory=list)
     phases_s: tuple[float, ...] = ()
 
 
@@ -244,28 +244,30 @@ class Event(NamedTuple):
     arguments: bytes
 
 
-class Ears:
-    """Understands a vehicle's messages."""
+class Decoder:
+    """Decoder of a vehicle's messages."""
 
     def __init__(self) -> None:
         self._mavlink = mavlink.MAVLink(None)
         self._mavlink.robust_parsing = True
 
-    def hear(self, at_s: float, data: bytes) -> list[Said]:
-        return [self._said(at_s, message) for message in self._mavlink.parse_buffer(data) or ()]
+    def decode(self, at_s: float, data: bytes) -> list[Stamped]:
+        return [self._stamped(at_s, message) for message in self._mavlink.parse_buffer(data) or ()]
 
     @staticmethod
-    def _said(at_s: float, message: Any) -> Said:
+    def _stamped(at_s: float, message: Any) -> Stamped:
         name = message.get_type()
         if name != "UNKNOWN_410":
-            return Said(at_s, UNNAMED.get(name, name), message)
+            return Stamped(at_s, UNNAMED.get(name, name), message)
         frame = bytes(message.data)
         payload = frame[10 : 10 + frame[1]].ljust(53, b"\0")
         number, _, _, _, _, level = struct.unpack_from("<IIHBBB", payload)
-        return Said(at_s, EVENT, Event(number & 0xFFFFFF, level & 0xF, payload[13:].rstrip(b"\0")))
+        return Stamped(
+            at_s, EVENT, Event(number & 0xFFFFFF, level & 0xF, payload[13:].rstrip(b"\0"))
+        )
 
 
-# A log file begins, a compass or a barometer fails over, the companion is lost and heard again, the
+# A log file begins, a compass or a barometer fails over, the companion is lost and back, the
 # battery would end PX4, a stick is let go.
 OTHER_EVENTS = {1203183, 5371654, 9421773, 11123101, 10716939, 5847165, 5623108}
 LANDING_DETECTED = 9844908
@@ -276,11 +278,13 @@ THINNED = {"ODOMETRY": 10, "ATTITUDE": 10, "VFR_HUD": 5}
 class Clock:
     """PX4's clock at a time of the recording."""
 
-    def __init__(self, heard: list[Said]) -> None:
-        told = [
-            (s.at_s, s.message.time_boot_ms / 1e3) for s in heard if s.name == "LOCAL_POSITION_NED"
+    def __init__(self, recorded: list[Stamped]) -> None:
+        times_s = [
+            (s.at_s, s.message.time_boot_ms / 1e3)
+            for s in recorded
+            if s.name == "LOCAL_POSITION_NED"
         ]
-        self._recorded_s, self._boot_s = np.array(told).T
+        self._recorded_s, self._boot_s = np.array(times_s).T
 
     def __call__(self, recorded_s: float) -> float:
         boot_s = float(np.interp(recorded_s, self._recorded_s, self._boot_s))
@@ -289,24 +293,24 @@ class Clock:
 
 @functools.cache
 def replay(name: str) -> Replay:
-    """Both vehicles' words, by PX4's clock."""
-    scenario, ears = SCENARIOS[name], Ears()
+    """Messages of both vehicles, by PX4's clock."""
+    scenario, decoder = SCENARIOS[name], Decoder()
     log = [entry for entry in frames(name) if entry[0] < scenario.until_s]
-    heard = [
-        said
+    recorded = [
+        message
         for at_s, frame in log
         if (frame[5], frame[6]) == (1, 1)
-        for said in ears.hear(at_s, frame)
+        for message in decoder.decode(at_s, frame)
     ]
-    clock = Clock(heard)
+    clock = Clock(recorded)
     sent = [
         (clock(at_s), frame)
         for at_s, frame in log
         if frame[6] != 1
-        # What PX4 forwards to the companion is no word of the companion.
+        # What PX4 forwards to the companion is not from the companion.
         and (frame[5] != GROUND_STATION or at_s >= scenario.gcs_on_link_from_s)
     ]
-    real = [said._replace(at_s=clock(said.at_s)) for said in heard]
+    real = [s._replace(at_s=clock(s.at_s)) for s in recorded]
     vehicle = Px4Vehicle(seed=1, ready_after_s=ready_s(real))
     todo = sorted(
         [
@@ -319,19 +323,19 @@ def replay(name: str) -> Replay:
     return Replay(real, simulated, tuple(clock(at_s) for at_s in scenario.phases_s))
 
 
-def ready_s(real: list[Said]) -> float:
+def ready_s(real: list[Stamped]) -> float:
     """When the estimator had its position: with the next check PX4 moved home there."""
     homes: list[float] = [s.message.time_usec / 1e6 for s in real if s.name == "HOME_POSITION"]
     return next(home_s for home_s in homes if home_s > 3.5) - CHECKS_PERIOD_S
 
 
-def charges(real: list[Said]) -> list[tuple[float, Callable[[Px4Vehicle], object]]]:
-    """What the battery had; SYS_STATUS tells it rounded up."""
-    told = [(s.at_s, s.message.battery_remaining - 0.5) for s in real if s.name == "SYS_STATUS"]
-    times_s = np.arange(told[0][0], told[-1][0], 0.1)
-    remaining = np.interp(times_s, *np.array(told).T) / 100.0
+def charges(real: list[Stamped]) -> list[tuple[float, Callable[[Px4Vehicle], object]]]:
+    """Charge of the battery; SYS_STATUS rounds it up."""
+    charges = [(s.at_s, s.message.battery_remaining - 0.5) for s in real if s.name == "SYS_STATUS"]
+    times_s = np.arange(charges[0][0], charges[-1][0], 0.1)
+    remaining = np.interp(times_s, *np.array(charges).T) / 100.0
     return [
-        # PX4 tells of it at once, and checks it up to a tenth of a second later.
+        # PX4 reports it at once, and checks it up to a tenth of a second later.
         (float(at_s) + CHECKS_PERIOD_S, sets(battery_remaining=max(float(charge), 0.0)))
         for at_s, charge in zip(times_s, remaining, strict=True)
     ]
@@ -341,14 +345,14 @@ def run(
     vehicle: Px4Vehicle,
     sent: list[tuple[float, bytes]],
     todo: list[tuple[float, Callable[[Px4Vehicle], object]]],
-    real: list[Said],
-) -> list[Said]:
-    """Fly the vehicle through the recording; returns what it said."""
-    # PX4 opens its link a second before it tells of itself for the first time.
-    opened_s = next(said.at_s for said in real if said.name == "HEARTBEAT") - 1.0
+    real: list[Stamped],
+) -> list[Stamped]:
+    """Fly the vehicle through the recording; returns its messages."""
+    # PX4 opens its link a second before its first message.
+    opened_s = next(s.at_s for s in real if s.name == "HEARTBEAT") - 1.0
     while vehicle.time_s < opened_s:
         vehicle.step(STEP_S)
-    link, ears, said = Px4Link(vehicle, system_id=1), Ears(), []
+    link, decoder, messages = Px4Link(vehicle, system_id=1), Decoder(), []
     sent, todo = list(reversed(sent)), list(reversed(todo))
     down_s = touchdown_s(real)
     while vehicle.time_s < real[-1].at_s:
@@ -363,11 +367,11 @@ def run(
             vehicle.position_m = np.array([north_m, east_m, down_m])
         vehicle.step(STEP_S)
         for datagram in link.due():
-            said += ears.hear(vehicle.time_s, datagram)
-    return said
+            messages += decoder.decode(vehicle.time_s, datagram)
+    return messages
 
 
-def touchdown_s(real: list[Said]) -> float:
+def touchdown_s(real: list[Stamped]) -> float:
     """When the real vehicle touched the ground, as its land detector later saw."""
     times_s = [s.at_s for s in real if s.name == EVENT and s.message.number == LANDING_DETECTED]
     return times_s[0] - LANDED_AFTER_S if times_s else np.inf
@@ -402,8 +406,8 @@ def test_the_same_messages_come_as_often(replayed: Replay) -> None:
     wrong = []
     for begin_s, end_s in itertools.pairwise(replayed.phases_s):
         real, simulated = (
-            Counter(s.name for s in said if begin_s <= s.at_s < end_s)
-            for said in (replayed.real, replayed.simulated)
+            Counter(s.name for s in messages if begin_s <= s.at_s < end_s)
+            for messages in (replayed.real, replayed.simulated)
         )
         for name in sorted((real | simulated).keys() - ON_PURPOSE.keys()):
             expected = real[name] * THINNED.get(name, 1)
@@ -412,10 +416,10 @@ def test_the_same_messages_come_as_often(replayed: Replay) -> None:
     assert not wrong
 
 
-def answers(said: list[Said]) -> list[tuple[float, tuple[int, ...]]]:
+def answers(messages: list[Stamped]) -> list[tuple[float, tuple[int, ...]]]:
     """The acknowledgements, one for each command, but for those of streams."""
     found: list[tuple[float, tuple[int, ...]]] = []
-    for at_s, name, message in said:
+    for at_s, name, message in messages:
         if name == "COMMAND_ACK" and message.command not in STREAM_COMMANDS:
             to = message.target_system, message.target_component
             answer = (message.command, message.result, *to)
@@ -437,18 +441,18 @@ def test_streams_and_messages_are_given_or_refused_alike(replayed: Replay) -> No
     real, simulated = (
         {
             (s.message.command, s.message.result)
-            for s in said
+            for s in messages
             if s.name == "COMMAND_ACK" and s.message.command in STREAM_COMMANDS
         }
-        for said in (replayed.real, replayed.simulated)
+        for messages in (replayed.real, replayed.simulated)
     )
     assert simulated == real - {NOTHING_NEW}
 
 
-def texts(said: list[Said]) -> list[tuple[float, tuple[int, int, str]]]:
+def texts(messages: list[Stamped]) -> list[tuple[float, tuple[int, int, str]]]:
     return [
         (s.at_s, (s.message.severity, s.message.chunk_seq, s.message.text))
-        for s in said
+        for s in messages
         if s.name == "STATUSTEXT" and "mission computer" not in s.message.text
     ]
 
@@ -460,10 +464,10 @@ def test_the_same_texts_come_where_a_ground_station_is_heard(replayed: Replay) -
         assert abs(simulated_s - real_s) < 0.1, text
 
 
-def events(said: list[Said]) -> list[tuple[float, Event]]:
+def events(messages: list[Stamped]) -> list[tuple[float, Event]]:
     return [
         (s.at_s, s.message)
-        for s in said
+        for s in messages
         if s.name == EVENT and s.message.number not in OTHER_EVENTS
     ]
 
@@ -476,16 +480,18 @@ def test_the_same_events_come(replayed: Replay) -> None:
         assert abs(simulated_s - real_s) < 0.75, event
 
 
-def thrusts(said: list[Said], begin_s: float, end_s: float) -> list[int]:
-    """In per cent, as told meanwhile."""
-    return [s.message.throttle for s in said if s.name == "VFR_HUD" and begin_s < s.at_s < end_s]
+def thrusts(messages: list[Stamped], begin_s: float, end_s: float) -> list[int]:
+    """In per cent, as reported."""
+    return [
+        s.message.throttle for s in messages if s.name == "VFR_HUD" and begin_s < s.at_s < end_s
+    ]
 
 
 def test_the_same_thrust_is_told() -> None:
     """Half of the greatest one to hover, none before takeoff and after landing."""
     flight = replay("normal")
     _, takeoff_s, mission_s, return_s, down_s, end_s = flight.phases_s
-    for said in (flight.real, flight.simulated):
-        hovering = thrusts(said, mission_s + 3.0, return_s)
+    for messages in (flight.real, flight.simulated):
+        hovering = thrusts(messages, mission_s + 3.0, return_s)
         assert hovering and all(44 <= thrust <= 56 for thrust in hovering)
-        assert max(thrusts(said, 0.0, takeoff_s) + thrusts(said, down_s, end_s)) <= 1
+        assert max(thrusts(messages, 0.0, takeoff_s) + thrusts(messages, down_s, end_s)) <= 1

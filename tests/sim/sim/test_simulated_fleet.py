@@ -77,13 +77,13 @@ def a_low_fleet(folder: Path) -> SimulatedFleet:
     )
 
 
-def all_are_ready(told: FleetSnapshot) -> bool:
-    return all(robot.status is not None and robot.status.ready for robot in told.robots)
+def all_are_ready(snapshot: FleetSnapshot) -> bool:
+    return all(robot.status is not None and robot.status.ready for robot in snapshot.robots)
 
 
 def to_ready(ground: SimulatedGround) -> Procedure[None]:
     """From the start to all robots ready to take off."""
-    yield Until(lambda told: all(robot.fresh for robot in told.robots), 30.0)
+    yield Until(lambda snapshot: all(robot.fresh for robot in snapshot.robots), 30.0)
     for request in (SetOrigin(ORIGIN), Enable()):
         report = yield request
         assert report.done, (request, report)
@@ -192,9 +192,9 @@ def test_whose_loop_hangs_is_held_and_whose_program_ends_lands() -> None:
     ground.carry_out(_pass(2.0))
     assert [each.vehicle.mode for each in fleet.vehicles] == [Px4Mode.HOLD, Px4Mode.LAND]
     ground.carry_out(_pass(3.0))
-    said = fleet.robots[0].status
-    assert said is not None
-    assert (said.state, said.reason.code) == (FlightState.HOLD, ReasonCode.CONTROL_SILENT)
+    status = fleet.robots[0].status
+    assert status is not None
+    assert (status.state, status.reason.code) == (FlightState.HOLD, ReasonCode.CONTROL_SILENT)
     assert ground.carry_out(_until(lambda _: all_are_down(fleet), 90.0))
 
 
@@ -244,13 +244,13 @@ def test_a_robot_says_what_befell_it_and_the_other_flies_on(
     fleet = _on_their_way(for_a_pilot=fault is flown_by_a_pilot).copy()
     fault(fleet)
 
-    def says_so(told: FleetSnapshot) -> bool:
-        return told.robots[0].status is not None and told.robots[0].status.state is state
+    def reports_it(snapshot: FleetSnapshot) -> bool:
+        return snapshot.robots[0].status is not None and snapshot.robots[0].status.state is state
 
-    assert fleet.ground.carry_out(_until(says_so, 10.0))
-    said, other = (robot.status for robot in fleet.ground.snapshot.robots)
-    assert said is not None and other is not None
-    assert said.reason.code is reason and said.reason in said.alarms
+    assert fleet.ground.carry_out(_until(reports_it, 10.0))
+    status, other = (robot.status for robot in fleet.ground.snapshot.robots)
+    assert status is not None and other is not None
+    assert status.reason.code is reason and status.reason in status.alarms
     assert other.state is FlightState.MISSION
     # Nor does it fly on when it is ordered to.
     assert not fleet.ground.command(Start(("r0",))).done
@@ -264,9 +264,9 @@ def test_a_receiver_that_repeats_itself_is_ignored_until_the_robot_has_landed() 
     vehicle.receiver.stuck = True
     at_m, began_s = vehicle.position_m, vehicle.time_s
 
-    def lands(told: FleetSnapshot) -> bool:
-        return told.robots[0].status is not None and (
-            told.robots[0].status.state is FlightState.LAND
+    def lands(snapshot: FleetSnapshot) -> bool:
+        return snapshot.robots[0].status is not None and (
+            snapshot.robots[0].status.state is FlightState.LAND
         )
 
     def is_down(_: FleetSnapshot) -> bool:
@@ -275,11 +275,11 @@ def test_a_receiver_that_repeats_itself_is_ignored_until_the_robot_has_landed() 
     assert fleet.ground.carry_out(_until(lambda _: not vehicle.parameters["EKF2_GPS_CTRL"], 1.5))
     assert fleet.ground.carry_out(_until(lands, 4.0))
     assert vehicle.time_s - began_s <= 3.5
-    said = fleet.ground.snapshot.robots[0].status
-    assert said is not None and said.reason.code is ReasonCode.POSITION_LOST
-    assert "repeats" in said.reason.text
-    # It was changed by the robot itself, and nobody is told otherwise.
-    assert ReasonCode.PX4_CHANGED not in {reason.code for reason in said.alarms}
+    status = fleet.ground.snapshot.robots[0].status
+    assert status is not None and status.reason.code is ReasonCode.POSITION_LOST
+    assert "repeats" in status.reason.text
+    # It was changed by the robot itself, and no alarm reports it.
+    assert ReasonCode.PX4_CHANGED not in {reason.code for reason in status.alarms}
     assert math.dist(vehicle.position_m[:2], at_m[:2]) < 5.0
     assert fleet.ground.carry_out(_until(is_down, 60.0))
     fleet.ground.carry_out(_pass(2.0))
@@ -327,12 +327,12 @@ def test_a_vehicle_that_others_change_on_the_ground_is_not_ready_until_it_is_set
     fleet.ground.carry_out(to_ready(fleet.ground))
     changed(fleet)
 
-    def says_why(told: FleetSnapshot) -> bool:
-        status = told.robots[0].status
+    def reports_why(snapshot: FleetSnapshot) -> bool:
+        status = snapshot.robots[0].status
         checks = () if status is None else status.failed_checks
         return any(check.code is code and "somebody else" in check.text for check in checks)
 
-    assert fleet.ground.carry_out(_until(says_why, 3.0))
+    assert fleet.ground.carry_out(_until(reports_why, 3.0))
     assert not all_are_ready(fleet.ground.snapshot)
     assert fleet.ground.carry_out(_until(all_are_ready, 10.0))
     assert as_preflight_found_it(fleet)
@@ -345,15 +345,15 @@ def test_a_vehicle_that_others_change_in_flight_is_set_back(
 ) -> None:
     fleet = in_mission()
     changed(fleet)
-    assert fleet.ground.carry_out(_until(tells_of_the_change, 5.0))
+    assert fleet.ground.carry_out(_until(reports_the_change, 5.0))
     fleet.ground.carry_out(_pass(3.0))
     assert as_preflight_found_it(fleet)
     # It still says so: somebody did it.
-    assert tells_of_the_change(fleet.ground.snapshot)
+    assert reports_the_change(fleet.ground.snapshot)
     assert states(fleet) == {FlightState.MISSION}
     assert fleet.ground.command(SafetyCommand("land", wait=True)).done
     fleet.ground.carry_out(_pass(3.0))
-    assert not tells_of_the_change(fleet.ground.snapshot)
+    assert not reports_the_change(fleet.ground.snapshot)
 
 
 def refused(name: str, value: float) -> None:
@@ -377,7 +377,7 @@ def test_a_vehicle_that_cannot_be_set_back_comes_home(
     fleet = in_mission()
     vars(fleet.vehicles[0]).update(cannot)
     changed(fleet)
-    assert fleet.ground.carry_out(_until(tells_of_the_change, 5.0))
+    assert fleet.ground.carry_out(_until(reports_the_change, 5.0))
     assert fleet.ground.carry_out(_until(returns_for_it, 6.0))
     other = fleet.ground.snapshot.robots[1].status
     assert other is not None and other.state is FlightState.MISSION
@@ -405,7 +405,7 @@ def test_who_flies_by_hand_may_change_what_he_likes() -> None:
     flown_by_a_pilot(fleet)
     fleet.ground.carry_out(_pass(3.0))
     gf_action_is(0)(fleet)
-    assert fleet.ground.carry_out(_until(tells_of_the_change, 5.0))
+    assert fleet.ground.carry_out(_until(reports_the_change, 5.0))
     fleet.ground.carry_out(_pass(10.0))
     assert fleet.vehicles[0].vehicle.parameters["GF_ACTION"] == 0
 
@@ -418,17 +418,17 @@ def test_what_was_found_right_is_still_watched_after_the_autopilot_was_silent() 
     fleet.ground.carry_out(_pass(1.0))
     gf_action_is(0)(fleet)
     assert fleet.vehicles[0].vehicle.armed
-    assert fleet.ground.carry_out(_until(tells_of_the_change, 5.0))
+    assert fleet.ground.carry_out(_until(reports_the_change, 5.0))
 
 
-def tells_of_the_change(told: FleetSnapshot) -> bool:
-    status = told.robots[0].status
+def reports_the_change(snapshot: FleetSnapshot) -> bool:
+    status = snapshot.robots[0].status
     alarms = () if status is None else status.alarms
     return any(alarm.code is ReasonCode.PX4_CHANGED for alarm in alarms)
 
 
-def returns_for_it(told: FleetSnapshot) -> bool:
-    status = told.robots[0].status
+def returns_for_it(snapshot: FleetSnapshot) -> bool:
+    status = snapshot.robots[0].status
     return status is not None and (status.state, status.reason.code) == (
         FlightState.RETURN, ReasonCode.PX4_CHANGED,
     )  # fmt: skip
@@ -459,15 +459,15 @@ def test_a_bad_link_to_the_autopilot_is_told(
         each.vehicle.wire = wire
     # A little longer than what is counted together.
     fleet.ground.carry_out(_pass(12.0))
-    for told in fleet.ground.snapshot.robots:
-        assert told.status is not None and told.status.state is FlightState.MISSION
-        (alarm,) = (alarm for alarm in told.status.alarms if alarm.code is code)
+    for robot in fleet.ground.snapshot.robots:
+        assert robot.status is not None and robot.status.state is FlightState.MISSION
+        (alarm,) = (alarm for alarm in robot.status.alarms if alarm.code is code)
         assert re.match(text, alarm.text)
     fleet.ground.command(SafetyCommand("land", wait=True))
     fleet.ground.carry_out(_pass(12.0))
-    for told in fleet.ground.snapshot.robots:
-        assert told.status is not None and code in [alarm.code for alarm in told.status.alarms]
-        assert CheckCode.OTHER_VEHICLES not in [check.code for check in told.status.failed_checks]
+    for robot in fleet.ground.snapshot.robots:
+        assert robot.status is not None and code in [alarm.code for alarm in robot.status.alarms]
+        assert CheckCode.OTHER_VEHICLES not in [check.code for check in robot.status.failed_checks]
 
 
 def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
@@ -482,8 +482,8 @@ def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
     # As by a loss of power, in flight: whoever comes back only looks.
     fleet.robots[0].start()
     ground.carry_out(_pass(5.0))
-    told = [e.text for e in ground.events if e.kind == "presence" and e.robot == "r0"]
-    assert told[-1] == "its program has restarted"
+    texts = [e.text for e in ground.events if e.kind == "presence" and e.robot == "r0"]
+    assert texts[-1] == "its program has restarted"
     assert fleet.robots[0].status is not None
     assert fleet.robots[0].status.state is FlightState.PILOT
     # A ground of the same computer knows what the one before said.
@@ -511,7 +511,7 @@ def _until(condition: Callable[[FleetSnapshot], bool], at_most_s: float) -> Proc
 
 
 def _until_all(condition: Callable[[RobotSnapshot], bool], at_most_s: float) -> Procedure[bool]:
-    came: bool = yield Until(lambda told: all(map(condition, told.robots)), at_most_s)
+    came: bool = yield Until(lambda snapshot: all(map(condition, snapshot.robots)), at_most_s)
     return came
 
 
@@ -597,12 +597,12 @@ def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
     assert flight.true_fence_margin_m > 0.0
     least = flight.true_separation
     assert least is not None and least.distance_m > DRONE_M
-    told = summary(scenario, flight)
-    assert told == summary(scenario, again)
-    assert [each["command"] for each in told["commands"]] == [
+    figures = summary(scenario, flight)
+    assert figures == summary(scenario, again)
+    assert [each["command"] for each in figures["commands"]] == [
         "origin", "again", "enable", "takeoff", "start", "return",
     ]  # fmt: skip
-    for each in told["commands"]:
+    for each in figures["commands"]:
         assert each["problem"] is None
         assert each["results"] == dict.fromkeys(("r0", "r1"), "done")
     assert flight.normalized[-1] < 1.0
@@ -647,10 +647,10 @@ def test_a_takeoff_that_fails_brings_all_down_and_is_tried_again(tmp_path: Path)
             low.gps_lost = False
 
     fleet.schedule.every(0.1, lose_gps_once)
-    said: list[str] = []
-    flight = ScriptedFlight(fleet.ground, tmp_path / "fleet.toml", 2.0, report=said.append)
+    lines: list[str] = []
+    flight = ScriptedFlight(fleet.ground, tmp_path / "fleet.toml", 2.0, report=lines.append)
     assert fleet.ground.carry_out(flight.fly()) is None
-    assert lost and any(text.startswith("all take off again: ") for text in said)
+    assert lost and any(text.startswith("all take off again: ") for text in lines)
     takeoffs = [done.report.done for done in flight.commands if isinstance(done.request, Takeoff)]
     assert takeoffs == [False, True]
     assert all_are_down(fleet)
@@ -760,25 +760,25 @@ def test_what_the_robots_logged_is_what_they_computed(logged: Logged) -> None:
 
 
 def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
-    """To the last digit: `lpac report` has the logs, the flight what the robots said to them."""
+    """To the last digit: `lpac report` has the logs, the flight the statuses of the robots."""
     flight = logged.flight
     (reported,) = examine([logged.folder], Wanted(), lambda *_: None).records
-    told = Examined((reported,), ()).summary()["trials"][0]
-    said = summary(LOGGED, flight)
-    for cost, truly in ((told["cost"], "cost"), (told["truth"]["cost"], "true_cost")):
+    trial = Examined((reported,), ()).summary()["trials"][0]
+    figures = summary(LOGGED, flight)
+    for cost, truly in ((trial["cost"], "cost"), (trial["truth"]["cost"], "true_cost")):
         assert 0.0 < cost["final"] != cost["initial"]
         assert [cost[key] for key in ("initial", "final", "normalized")] == [
-            said[truly][key] for key in ("initial", "final", "final_normalized")
+            figures[truly][key] for key in ("initial", "final", "final_normalized")
         ]
-    assert told["cost"]["curve"] == said["cost_curve"]["normalized_cost"]
+    assert trial["cost"]["curve"] == figures["cost_curve"]["normalized_cost"]
     for key in (
         "duration_s", "curve_time_s", "cost", "true_cost", "lloyd", "separation", "true_separation",
         "fence_margin_m", "true_fence_margin_m",
     ):  # fmt: skip
         np.testing.assert_equal(getattr(reported, key), getattr(flight, key), key)
-    assert told["fence_margin_m"] == said["fence"]["margin_m"] is not None
-    assert told["truth"]["fence_margin_m"] == said["fence"]["true_margin_m"] is not None
-    assert told["truth"]["separation"]["distance_m"] == said["separation"]["distance_m"]
+    assert trial["fence_margin_m"] == figures["fence"]["margin_m"] is not None
+    assert trial["truth"]["fence_margin_m"] == figures["fence"]["true_margin_m"] is not None
+    assert trial["truth"]["separation"]["distance_m"] == figures["separation"]["distance_m"]
     for robot, flown in zip(reported.robots, flight.robots, strict=True):
         assert reported.mission_share(robot) == flight.mission_share(flown) > 0.5
 

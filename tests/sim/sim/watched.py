@@ -1,6 +1,6 @@
-"""A vehicle that flies about with its sensors' errors, and what its robot takes its position for.
+"""A vehicle that flies about with sensor errors, and its robot's judgement of the position.
 
-It talks as PX4 does; the judgement is looked at ten times a second, as in flight.
+It sends as PX4 does; the position is judged ten times a second, as in flight.
 """
 
 import math
@@ -26,7 +26,7 @@ _TURN_S = 10.0
 
 
 class Watched:
-    """A vehicle that flies about, and what its robot would take its position to be worth."""
+    """A vehicle that flies about, and its robot's judgement of the position."""
 
     def __init__(self, seed: int, endurance_s: float) -> None:
         self.vehicle = Px4Vehicle(
@@ -41,10 +41,10 @@ class Watched:
         self._link, self._telemetry = Px4Link(self.vehicle, system_id=1), Px4Telemetry()
         self._parser: Any = mavlink.MAVLink(None)
         self._parser.robust_parsing = True
-        _ask_for_streams(self._link)
+        _request_streams(self._link)
 
     def tick(self) -> None:
-        """Fly for a tenth of a second, and look."""
+        """Fly for a tenth of a second, and judge the position."""
         vehicle, telemetry = self.vehicle, self._telemetry
         for _ in range(round(TICK_S / STEP_S)):
             vehicle.step(STEP_S)
@@ -53,10 +53,10 @@ class Watched:
                     if message.get_type() in telemetry.messages:
                         telemetry.receive(message.get_type(), message.to_dict(), vehicle.time_s)
         now_s = vehicle.time_s
-        heard = telemetry.state(now_s)
-        self.judgement = judge(self.judgement, heard, PositionLimits(), now_s)
-        if vehicle.armed and heard.gps is not None and heard.gps.offset_m is not None:
-            self.greatest_offset_m = max(self.greatest_offset_m, heard.gps.offset_m)
+        state = telemetry.state(now_s)
+        self.judgement = judge(self.judgement, state, PositionLimits(), now_s)
+        if vehicle.armed and state.gps is not None and state.gps.offset_m is not None:
+            self.greatest_offset_m = max(self.greatest_offset_m, state.gps.offset_m)
         if now_s % _TURN_S < TICK_S:
             bearing = self._rng.uniform(0.0, math.tau)
             self._velocity_m_s[:2] = _SPEED_M_S * np.array([math.cos(bearing), math.sin(bearing)])
@@ -68,13 +68,13 @@ class Watched:
             vehicle.arm()
 
 
-def _ask_for_streams(link: Px4Link) -> None:
-    """As the robot does; what it does not listen to is switched off, which saves time."""
+def _request_streams(link: Px4Link) -> None:
+    """Request the streams of a robot; all others are off, which saves time."""
     sender: Any = mavlink.MAVLink(None, srcSystem=1, srcComponent=195)
-    unheard = (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ODOMETRY)
+    unused = (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ODOMETRY)
     for message, interval_us in (
         *((message, 1e6 / rate_hz) for message, rate_hz in RATES_HZ.items()),
-        *((message, -1.0) for message in unheard),
+        *((message, -1.0) for message in unused),
     ):
         command = mavlink.MAVLink_command_long_message(
             1, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message, interval_us, 0, 0, 0, 0, 0
