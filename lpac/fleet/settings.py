@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from edge.core.address import ipv4, is_loopback_endpoint, require_host, same_host
+from edge.core.address import ipv4, is_loopback, require_host, same_host
 from edge.core.schema import Bounded, ConfigError, PointXY, from_mapping
 from edge.core.toml import parse_toml, read_toml_text
 from edge.flight.margins import Margin, places_apart
@@ -352,6 +352,13 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
         except RuntimeError:
             raise ConfigError(f"{path}: {text!r}: unknown user: no home folder") from None
 
+    robots = {
+        name: _robot(name, robot, table.robot, f"{path}: robots.{name}")
+        for name, robot in table.robots.items()
+    }
+    # As in a simulation.
+    all_here = bool(robots) and all(is_loopback(robot.address) for robot in robots.values())
+    keys = table.keys or ("" if table.insecure or all_here else f"{_KEYS}/{table.fleet}")
     config = FleetConfig(
         path=path,
         fleet=table.fleet,
@@ -360,32 +367,18 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
         world=place(table.world),
         directory=table.directory,
         predecessors=table.predecessors,
-        ssh=SshConfig(
-            str(place(table.ssh.config)) if table.ssh.config else "",
-            table.ssh.connect_timeout_s,
-        ),
-        robots={
-            name: _robot(name, robot, table.robot, f"{path}: robots.{name}")
-            for name, robot in table.robots.items()
-        },
+        ssh=replace(table.ssh, config=table.ssh.config and str(place(table.ssh.config))),
+        robots=robots,
         slots=table.slots,
         shared=table.robot,
-        keys=None,
+        keys=place(keys) if keys else None,
         insecure=table.insecure,
         radio=table.radio,
     )
-    needs_keys = not table.insecure and not _is_local(config)
-    if table.keys or needs_keys:
-        config = replace(config, keys=place(table.keys or f"{_KEYS}/{table.fleet}"))
     for mistake in itertools.chain(_duplicates(config), _slot_mistakes(config)):
         raise ConfigError(f"{path}: {mistake}")
     _check_flights(config)
     return config
-
-
-def _is_local(config: FleetConfig) -> bool:
-    """Whether all robots are on this computer, as in a simulation."""
-    return bool(config.robots) and all(map(is_loopback_endpoint, config.endpoints))
 
 
 def _without_empty(slot: Mapping[str, Any]) -> dict[str, Any]:
