@@ -54,8 +54,8 @@ export function colour(name) {
 }
 
 // Formats a number with that many decimals, or a dash.
-export function number(value, digits = 0, unit = "") {
-  return value === null || value === undefined ? "–" : value.toFixed(digits) + unit;
+export function number(value, digits) {
+  return value === null || value === undefined ? "–" : value.toFixed(digits);
 }
 
 // Formats degrees in [0, 360), also after rounding.
