@@ -1,5 +1,6 @@
 """A moment of a flight: common input of the benches of one robot's tick."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from edge.core.memory import RobotMap, RobotMemory
 from edge.core.perception import PerceptionParameters, window_corner
 from edge.core.world import rasterize
 from edge.drivers.world_sensor import WorldSensor
-from edge.policy.family import Observation, Policy
+from edge.policy.family import Neighbourhood, Observation, Policy
 from lpac.analysis.worlds import random_features
 
 NEIGHBOURS = 10
@@ -47,8 +48,22 @@ def moment_in_flight(policy: Policy) -> Moment:
         agent, theirs = policy.agent(), _seen_on(path, importance, perception)[0]
         others = np.delete(ends, number, axis=0)
         seen = agent.observe(Observation(path[-1], theirs.local_map(path[-1]), others, np.zeros(2)))
-        payloads.append(agent.step(seen.features, [], NEIGHBOURS).payload.copy())
+        nobody = Neighbourhood.silent(NEIGHBOURS)
+        payloads.append(agent.step(seen.features, nobody).payload.copy())
     return Moment(ends[0], ends[1:], payloads, memory, robot_map)
+
+
+def neighbourhood(position: F64, neighbours: F64, payloads: Sequence[F32]) -> Neighbourhood:
+    """The first of the `neighbours` (n, 2) in range have sent `payloads`, standing still."""
+    sent = len(payloads)
+    return Neighbourhood(
+        robot_ids=tuple(range(1, sent + 1)),
+        payloads=payloads,
+        positions=(neighbours[:sent] - position).astype(np.float32),
+        velocities=np.zeros((sent, 2), np.float32),
+        ages_s=np.zeros(sent, np.float32),
+        degree=len(neighbours),
+    )
 
 
 def _seen_on(

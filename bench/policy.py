@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from bench import BUNDLE, CHECKPOINT, cnn
-from bench.moment import NEIGHBOURS, Moment, moment_in_flight
+from bench.moment import NEIGHBOURS, Moment, moment_in_flight, neighbourhood
 from bench.result import Result, Table, Target, progress
 from bench.timing import interleaved, quartiles, with_quartiles
 from bench.torch_robot import Network, PygLayer, TapLayer, TorchRobot, exchange_inputs, load_network
@@ -20,7 +20,7 @@ from edge.core import F32
 from edge.core.aggregation import HopBuffer
 from edge.policy.bundle import load_bundle
 from edge.policy.family import Observation
-from edge.policy.lpac.images import PolicyImages
+from edge.policy.images import PolicyImages
 from edge.policy.lpac.manifest import gnn_graph
 from edge.policy.lpac.policy import LpacPolicy
 
@@ -95,12 +95,13 @@ class EdgeRobot:
         assert images
         self._images = PolicyImages(policy.manifest.perception, images.channels, images.size)
         self._agent = policy.agent()
+        self._neighbours = neighbourhood(moment.position, moment.neighbours, moment.payloads)
         self.features = self._agent.observe(self._observation()).features
 
     def tick(self) -> Outputs:
         """Velocity (2,) and message (message_size,)."""
         features = self._agent.observe(self._observation()).features
-        return self._agent.step(features, self._moment.payloads, NEIGHBOURS)
+        return self._agent.step(features, self._neighbours)[:2]
 
     def exchange(self) -> Outputs:
         """The graph neural network alone: x_L (F_L,) and message (message_size,)."""

@@ -18,7 +18,7 @@ from torch_geometric.nn import MLP, TAGConv  # type: ignore[import-untyped]
 
 from edge.core import F32, F64
 from edge.core.perception import PerceptionParameters, part_in_world, window_corner
-from edge.policy.lpac.images import neighbour_maps
+from edge.policy.images import neighbour_maps
 
 _LEAKY_RELU_SLOPE = 0.01
 

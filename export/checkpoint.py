@@ -21,7 +21,7 @@ import torch
 from edge.core import F32
 from edge.core.aggregation import Geometry
 from edge.core.file_errors import in_words
-from edge.policy.lpac.images import MAP_CHANNELS
+from edge.policy.images import MAP_CHANNELS
 
 # Not stored in a state dict: torch's default for batch norms, and CoverageControl's slope.
 BATCH_NORM_EPS = 1e-5
@@ -224,7 +224,12 @@ def _checkpoint(source: _Source) -> Checkpoint:
     return Checkpoint(Geometry(taps - 1, features), cnn, gnn, action, source.sha256)
 
 
-def _state_dict(path: Path, content: bytes) -> _Source:
+def read_state_dict(path: Path) -> dict[str, torch.Tensor]:
+    """Read a state dict of any module, alone or beside an optimiser's. Raises CheckpointError."""
+    return _tensors(path, _read_bytes(path))
+
+
+def _tensors(path: Path, content: bytes) -> dict[str, torch.Tensor]:
     state = _load(content, path)
     if isinstance(state, dict):
         # Training programs often store it beside the optimiser and the epoch.
@@ -240,6 +245,11 @@ def _state_dict(path: Path, content: bytes) -> _Source:
                 f"{path}: {name}: found a {type(value).__name__}, expected tensors by name: "
                 "save model.state_dict() alone"
             )
+    return state
+
+
+def _state_dict(path: Path, content: bytes) -> _Source:
+    state = _tensors(path, content)
     # torch.compile prefixes the names of compiled parts, which may be all or some.
     prefix = _COMPILED_PREFIX if all(name.startswith(_COMPILED_PREFIX) for name in state) else ""
     source_names = {name.replace(_COMPILED_PREFIX, ""): name for name in state}

@@ -18,8 +18,9 @@ from edge.policy.bundle import (
     make_bundle,
 )
 from edge.policy.family import TOLERANCE
-from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
-from edge.policy.lpac.manifest import GOLDEN, Images, LpacManifest
+from edge.policy.golden import GOLDEN
+from edge.policy.images import EXPLORED, MAP_CHANNELS
+from edge.policy.lpac.manifest import Images, LpacManifest
 from edge.policy.lpac.policy import LpacPolicy
 from export.checkpoint import POSITION_SIZE, Checkpoint, CheckpointError, read_checkpoint
 from export.golden import golden_vectors

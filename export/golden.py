@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from edge.core import F32, F64
-from edge.policy.lpac.images import (
+from edge.policy.images import (
     EXPLORED,
     MAP_CHANNELS,
     NEIGHBOURS,
@@ -110,16 +110,18 @@ def _images(cnn: Cnn) -> F32:
     for channel in range(cnn.channels):
         alone[channel, channel] = random.uniform(-0.1, 0.1, shape[1:])
     dense = random.uniform(-0.1, 0.1, (2, *shape))
-    flight = _flight_images(cnn, 4, random)
+    flight = flight_images(cnn.channels, cnn.image_size, 4, random)
     return np.concatenate([blank, alone, dense, flight]).astype(np.float32)
 
 
-def _flight_images(cnn: Cnn, count: int, random: np.random.Generator) -> F64:
-    """Important places in the seen area, some neighbours, the world's corner on one side."""
-    size = cnn.image_size
+def flight_images(channels: int, size: int, count: int, random: np.random.Generator) -> F64:
+    """Images (count, channels, size, size) as in flight, for one of `MAP_CHANNELS`.
+
+    Important places in the seen area, some neighbours, the world's corner on one side.
+    """
     cells = (np.arange(size) + 0.5) / size
     x, y = np.meshgrid(cells, cells, indexing="ij")
-    images = np.zeros((count, cnn.channels, size, size))
+    images = np.zeros((count, channels, size, size))
     for image in images:
         peaks = random.uniform(0.1, 0.9, (4, 2))
         importance = sum(np.exp(-((x - px) ** 2 + (y - py) ** 2) / 0.02) for px, py in peaks)
@@ -132,7 +134,7 @@ def _flight_images(cnn: Cnn, count: int, random: np.random.Generator) -> F64:
         offsets = random.uniform(-0.9, 0.9, (random.integers(1, 6), 2))
         maps |= zip(NEIGHBOURS, neighbour_maps(offsets, 1.0, size), strict=True)
         maps[OWN_CELL] = own_cell(offsets, 1.0, size)
-        image[:] = [maps[channel] for channel in MAP_CHANNELS[cnn.channels]]
+        image[:] = [maps[channel] for channel in MAP_CHANNELS[channels]]
     return images
 
 
@@ -180,8 +182,9 @@ def _swarm_features(checkpoint: Checkpoint) -> F32:
     """x_0 (N, F_0): the CNN's features of images as in flight, or random ones, and positions."""
     random = _random()
     if checkpoint.cnn:
-        images = _flight_images(checkpoint.cnn, _ROBOTS, random)
-        features = network.cnn_features(checkpoint.cnn, torch.from_numpy(images)).numpy()
+        cnn = checkpoint.cnn
+        images = flight_images(cnn.channels, cnn.image_size, _ROBOTS, random)
+        features = network.cnn_features(cnn, torch.from_numpy(images)).numpy()
     else:
         inputs = checkpoint.geometry.feature_sizes[0] - POSITION_SIZE
         features = random.standard_normal((_ROBOTS, inputs))

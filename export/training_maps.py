@@ -9,7 +9,7 @@ depends on the world's size.
 import numpy as np
 
 from edge.core.perception import PerceptionParameters
-from edge.policy.lpac.images import MAP_CHANNELS
+from edge.policy.images import MAP_CHANNELS
 from export.checkpoint import Cnn
 
 # Largest residual of the filters' means. Trained CNNs leave 0.5 %; an untrained batch norm 100 %.

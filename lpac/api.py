@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from edge.policy.bundle import BundleError as BundleError
     from edge.policy.bundle import load_bundle as load_bundle
     from edge.policy.family import Agent as Agent
+    from edge.policy.family import Neighbourhood as Neighbourhood
     from edge.policy.family import Observation as Observation
     from edge.policy.family import Policy as Policy
     from edge.robot.pac import Pac as Pac
@@ -116,7 +117,7 @@ _TAKEN = {
     "edge.drivers.registry": "load_policy",
     "edge.drivers.world_sensor": "WorldSensor",
     "edge.policy.bundle": "Bundle BundleError load_bundle",
-    "edge.policy.family": "Agent Observation Policy",
+    "edge.policy.family": "Agent Neighbourhood Observation Policy",
     "edge.robot.pac": "Pac PacParameters PolicyTick",
     "lpac.analysis.arrays": "Columns log_arrays",
     "lpac.analysis.coverage": "Coverage",

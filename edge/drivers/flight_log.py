@@ -576,7 +576,8 @@ ROBOT_TOPICS = {
     ),
     "policy": topic(
         "Policy", features=np.ndarray, senders=tuple[int, ...], payloads=tuple[np.ndarray, ...],
-        degree=int, velocity=np.ndarray, message=bytes,
+        positions=np.ndarray, velocities=np.ndarray, ages_s=np.ndarray, degree=int, inputs=object,
+        velocity=np.ndarray, message=bytes,
     ),
     "received": topic("Received", sender=int, sequence=int, age_s=float, rejection=str),
     "control": topic(

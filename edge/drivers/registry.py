@@ -43,6 +43,7 @@ _BUILT_IN = {
     (entry.group, entry.name): entry
     for entry in (
         EntryPoint("lpac", "edge.policy.lpac.policy:LpacPolicy", _POLICIES),
+        EntryPoint("network", "edge.policy.network.policy:NetworkPolicy", _POLICIES),
         EntryPoint("world", "edge.drivers.world_sensor:world_sensor", _SENSORS),
         EntryPoint("px4", "edge.drivers.px4.driver:px4_vehicle", _VEHICLES),
         EntryPoint("zenoh", "edge.drivers.link:zenoh_link", _LINKS),

@@ -7,7 +7,7 @@ family.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from edge.policy.bundle import Bundle, BundleError, Manifest
 
 # Six times the float32 rounding on x86-64 and on AArch64.
 TOLERANCE = 1e-5
+_NO_INPUTS: Mapping[str, F32] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +26,12 @@ class GoldenCheck:
 
     name: str
     relative_error: float
+    tolerance: float = TOLERANCE
 
     @property
     def passed(self) -> bool:
-        """Whether the error is within TOLERANCE; False for NaN."""
-        return self.relative_error <= TOLERANCE
+        """Whether the error is within the tolerance; False for NaN."""
+        return self.relative_error <= self.tolerance
 
 
 class Observation(NamedTuple):
@@ -59,14 +61,40 @@ class Perceived(NamedTuple):
     inputs: Mapping[str, F32]
 
 
+class Neighbourhood(NamedTuple):
+    """The neighbours' newest messages at a policy step, in the order of the robots' ids.
+
+    `robot_ids` (n,) are the senders, `payloads` n of (message_size,), float16 or float32.
+    `positions` (n, 2), in model units, are the senders' when they sent, relative to the robot's
+    present one; `velocities` (n, 2), in model units/s, are theirs then. `ages_s` (n,) are the
+    messages' greatest possible ages. `degree` is the number of robots in range, including those
+    without a message this time.
+    """
+
+    robot_ids: tuple[int, ...]
+    payloads: Sequence[F32]
+    positions: F32
+    velocities: F32
+    ages_s: F32
+    degree: int
+
+    @classmethod
+    def silent(cls, degree: int) -> "Neighbourhood":
+        """Robots in range without any message."""
+        nowhere, never = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+        return cls((), (), nowhere, nowhere, never, degree)
+
+
 class PolicyStep(NamedTuple):
     """An agent's next action and message, in new arrays.
 
     `velocity` (2,) is in model units/s, `payload` (message_size,) is sent to the neighbours.
+    `inputs`, by name, are written to the flight log: the agent's state before the step.
     """
 
     velocity: F32
     payload: F32
+    inputs: Mapping[str, F32] = _NO_INPUTS
 
 
 class Agent(Protocol):
@@ -79,12 +107,10 @@ class Agent(Protocol):
     def observe(self, observation: Observation) -> Perceived:
         """Compute features. The observation's map is the only memory of what the robot saw."""
 
-    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+    def step(self, features: F32, neighbours: Neighbourhood) -> PolicyStep:
         """Compute an action from the newest features and the neighbours' newest messages.
 
-        `payloads` are (message_size,), float16 or float32, in the order of the robots' ids.
-        `degree` is the number of neighbours, including those without a message this time. A
-        velocity or payload that is not finite, or has another shape or type, stops the robot.
+        A velocity or payload that is not finite, or has another shape or type, stops the robot.
         """
 
     def reset(self) -> None:
@@ -132,6 +158,19 @@ class Policy(Protocol):
 
         Raises BundleError if they cannot be read.
         """
+
+
+@runtime_checkable
+class Replayable(Protocol):
+    """A policy whose features and steps can be computed again from a flight log."""
+
+    def logged_features(self, inputs: Mapping[str, F32]) -> F32:
+        """Features from the `Perceived.inputs` of an observation. Raises KeyError, ValueError."""
+
+    def logged_step(
+        self, features: F32, neighbours: Neighbourhood, inputs: Mapping[str, F32]
+    ) -> PolicyStep:
+        """Step with the `PolicyStep.inputs` of a step. Raises KeyError, ValueError."""
 
 
 class PolicyFamily(Protocol):

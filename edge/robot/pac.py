@@ -8,13 +8,12 @@ simulated time.
 import functools
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from edge.core import F32, F64, Bools
 from edge.core.aggregation import AggregatedMessage
@@ -33,6 +32,7 @@ from edge.messages.beacon import BEACON_BYTES, Beacon, tag
 from edge.messages.bounds import RobotId
 from edge.policy.bundle import BundleError
 from edge.policy.family import (
+    Neighbourhood,
     Observation,
     Perceived,
     Policy,
@@ -97,14 +97,19 @@ class _OutgoingMap(NamedTuple):
 class PolicyTick:
     """Record of one `Pac.infer`.
 
-    The inputs are `features`, the `payloads` of `senders`, and `degree`, the count of neighbours.
-    The outputs are `velocity` (2,), in model units, and `message`, sent after a beacon.
+    The inputs are `features`, the fields of a `Neighbourhood`, with `senders` for the robots' ids,
+    and the `inputs` of the `PolicyStep`. The outputs are `velocity` (2,), in model units/s, and
+    `message`, sent after a beacon.
     """
 
     features: F32
     senders: tuple[int, ...]
-    payloads: tuple[F32, ...]
+    payloads: Sequence[F32]
+    positions: F32
+    velocities: F32
+    ages_s: F32
     degree: int
+    inputs: Mapping[str, F32]
     velocity: F32
     message: bytes
 
@@ -267,25 +272,37 @@ class Pac:
             return None
         (own,) = self._to_model([odometry.position_m])
         # Before the swap, which may remove messages: not all neighbours have sent a new one.
-        neighbours = self.table.neighbours(now_s)
+        kept = self.table.neighbours(now_s)
         received = self.table.swap(now_s)
-        near = self._in_range(own, [_position_m(each) for each in (*received, *neighbours)])
-        near, neighbours_near = near[: len(received)], near[len(received) :]
-        degree = max(int(neighbours_near.sum()), int(near.sum()))
+        positions = self._to_model([_position_m(each) for each in (*received, *kept)])
+        near = neighbours_in_range(own, positions, self._perception.communication_range)
+        near, kept_near = near[: len(received)], near[len(received) :]
         used = [each for each, is_near in zip(received, near, strict=True) if is_near]
-        payloads = tuple(each.message.payload for each in used)
-        step = self._step(features.value, payloads, degree)
+        velocities_m_s = [each.beacon.velocity_m_s or (0.0, 0.0, 0.0) for each in used]
+        neighbours = Neighbourhood(
+            robot_ids=tuple(each.beacon.robot_id for each in used),
+            payloads=tuple(each.message.payload for each in used),
+            positions=(positions[: len(received)][near] - own).astype(np.float32),
+            velocities=self._velocities(velocities_m_s).astype(np.float32),
+            ages_s=np.array([now_s - each.sent_at_s for each in used], np.float32),
+            degree=max(int(kept_near.sum()), int(near.sum())),
+        )
+        step = self._step(features.value, neighbours)
         if step is None:
             return None
-        velocity, payload = step
+        velocity, payload, inputs = step
         velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(velocity.astype(np.float64))
         self._action = _Timed(limit_speed(velocity_m_s, self._parameters.max_speed_m_s), now_s)
         message = AggregatedMessage(payload, *self._outgoing_map)
         return PolicyTick(
             features=features.value,
-            senders=tuple(each.beacon.robot_id for each in used),
-            payloads=payloads,
-            degree=degree,
+            senders=neighbours.robot_ids,
+            payloads=neighbours.payloads,
+            positions=neighbours.positions,
+            velocities=neighbours.velocities,
+            ages_s=neighbours.ages_s,
+            degree=neighbours.degree,
+            inputs=inputs,
             velocity=velocity,
             message=encode(message, self._parameters.payload, as_in_flight=on_ground),
         )
@@ -369,12 +386,12 @@ class Pac:
         self._observe_problem = perceived_problem(perceived)
         return None if self._observe_problem else perceived
 
-    def _step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep | None:
+    def _step(self, features: F32, neighbours: Neighbourhood) -> PolicyStep | None:
         try:
             if self._reset_agent:
                 self._reset_agent = False
                 self._agent.reset()
-            step = self._agent.step(features, payloads, degree)
+            step = self._agent.step(features, neighbours)
         except Exception as error:
             self._step_problem = in_one_line(error)
             raise self._raised("policy", self._step_problem) from error
@@ -384,16 +401,15 @@ class Pac:
     def _raised(self, part: str, problem: str) -> PartError:
         return PartError(f"robot {self._robot_id}: {part}: {problem}")
 
-    def _in_range(self, own: F64, positions_m: Sequence[Position]) -> npt.NDArray[np.bool_]:
-        """Whether each position (n, 3) is within communication range of `own`, in model units."""
-        return neighbours_in_range(
-            own, self._to_model(positions_m), self._perception.communication_range
-        )
-
     def _to_model(self, positions_m: Sequence[Position]) -> F64:
         """Horizontal positions (n, 2) in model units."""
         horizontal = np.array(positions_m, np.float64).reshape(-1, 3)[:, :2]
         return self._parameters.scale.position_to_model(horizontal)
+
+    def _velocities(self, velocities_m_s: Sequence[Position]) -> F64:
+        """Horizontal velocities (n, 2) in model units/s."""
+        horizontal = np.array(velocities_m_s, np.float64).reshape(-1, 3)[:, :2]
+        return self._parameters.scale.velocity_to_model(horizontal)
 
     def _is_old(self, timed: _Timed[Any], now_s: float) -> bool:
         return now_s - timed.time_s > self._parameters.max_input_age_s

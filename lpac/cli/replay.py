@@ -140,8 +140,8 @@ def _policy(
     from itertools import chain
 
     from edge.drivers.log_reader import read
+    from edge.drivers.registry import load_policy
     from edge.policy.bundle import BundleError, load_bundle
-    from edge.policy.lpac.policy import LpacPolicy
     from lpac.analysis.policy_replay import replay as run_again
 
     bundle_path = given or Path(next(iter(metadata.values())).bundle_path)
@@ -157,13 +157,10 @@ def _policy(
                 f"{path}: flew with bundle {flown.bundle_id[:12]}, "
                 f"and {bundle_path} is {bundle.id[:12]}"
             )
-    if bundle.manifest.family != "lpac":
-        # The internal state of other families is not in the log.
-        return bundle, ()
     messages = chain.from_iterable(
         read(path, "perception", "policy", on_gap=_reported_already) for path in metadata
     )
-    return bundle, run_again(LpacPolicy(bundle), messages)
+    return bundle, run_again(load_policy(bundle), messages)
 
 
 def _has_policy_ticks(paths: Iterable[Path]) -> bool:

@@ -7,7 +7,7 @@ from edge.drivers.registry import load_policy
 from edge.identity.envelope import OVERHEAD_BYTES
 from edge.messages.beacon import BEACON_BYTES
 from edge.policy.bundle import Bundle
-from edge.policy.family import Observation, PolicyStep
+from edge.policy.family import Neighbourhood, Observation, PolicyStep
 
 
 class ReceivingRobot:
@@ -29,12 +29,19 @@ class ReceivingRobot:
             middle + rng.uniform(-reach, reach, (others, 2)),
             np.zeros(2),
         )
-        self._payloads = list(rng.random((others, policy.message_size), np.float32))
+        self._neighbours = Neighbourhood(
+            robot_ids=tuple(range(1, others + 1)),
+            payloads=list(rng.random((others, policy.message_size), np.float32)),
+            positions=(self._observed.neighbours - middle).astype(np.float32),
+            velocities=np.zeros((others, 2), np.float32),
+            ages_s=np.zeros(others, np.float32),
+            degree=others,
+        )
 
     def step(self) -> PolicyStep:
         """Perceive and decide."""
         features = self._agent.observe(self._observed).features
-        return self._agent.step(features, self._payloads, len(self._payloads))
+        return self._agent.step(features, self._neighbours)
 
 
 def message_bytes(bundle: Bundle, others: int) -> int:

@@ -19,7 +19,7 @@ from torch.nn import functional
 from edge.core import F32
 from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, from_mapping
 from edge.policy.bundle import Bundle
-from edge.policy.lpac.images import MAP_CHANNELS, NEIGHBOURS
+from edge.policy.images import MAP_CHANNELS, NEIGHBOURS
 from export.checkpoint import (
     ACTION_SIZE,
     BATCH_NORM_EPS,

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters
 from edge.policy.bundle import Bundle
-from edge.policy.family import Observation
+from edge.policy.family import Neighbourhood, Observation
 from lpac.sim.batch import BatchedFlights, BatchMoment, PolicyFailedError
 from lpac.sim.batch.agents import Agents, Inputs, PolicySteps, make_agents
 from lpac.sim.failure import Failure
@@ -231,8 +231,7 @@ class _MixedAgents:
         self,
         robots: Sequence[int],
         features: Sequence[F32],
-        payloads: Sequence[Sequence[F32]],
-        degrees: Sequence[int],
+        neighbours: Sequence[Neighbourhood],
     ) -> PolicySteps:
         velocities = np.zeros((len(robots), 2), np.float32)
         payloads_out = np.zeros((len(robots), self.message_size), np.float32)
@@ -241,8 +240,7 @@ class _MixedAgents:
             steps = self._policy.step(
                 [robots[i] for i in deciding],
                 [features[i] for i in deciding],
-                [payloads[i] for i in deciding],
-                [degrees[i] for i in deciding],
+                [neighbours[i] for i in deciding],
             )
             velocities[deciding], payloads_out[deciding] = steps
         by_expert: dict[int, list[int]] = {}

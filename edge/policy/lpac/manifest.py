@@ -6,9 +6,9 @@ from typing import Literal
 from edge.core.aggregation import Geometry
 from edge.core.schema import AtLeastOne, Bounded, ConfigError, from_mapping
 from edge.policy.bundle import LPAC, BundleError, Manifest
-from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
+from edge.policy.golden import GOLDEN
+from edge.policy.images import EXPLORED, MAP_CHANNELS
 
-GOLDEN = "golden.npz"
 CNN = "cnn.onnx"
 ACTION = "action.onnx"
 

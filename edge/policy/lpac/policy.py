@@ -1,16 +1,18 @@
 """A bundle of this family as a policy for robots."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from edge.core import F32, F64
 from edge.core.aggregation import HopBuffer
+from edge.core.part import array_problem
 from edge.policy.bundle import Bundle, BundleError
-from edge.policy.family import GoldenCheck, Observation, Perceived, PolicyStep
+from edge.policy.family import GoldenCheck, Neighbourhood, Observation, Perceived, PolicyStep
+from edge.policy.golden import GOLDEN
+from edge.policy.images import PolicyImages
 from edge.policy.lpac.graphs import Graphs
-from edge.policy.lpac.images import PolicyImages
-from edge.policy.lpac.manifest import GOLDEN
+from edge.policy.lpac.manifest import CNN
 from edge.policy.lpac.verify import verify
 
 
@@ -34,6 +36,30 @@ class LpacPolicy(Graphs):
         """Verify each graph, then a whole swarm. Raises BundleError."""
         return verify(self, self._golden)
 
+    def logged_features(self, inputs: Mapping[str, F32]) -> F32:
+        """See `edge.policy.family.Replayable`."""
+        images = self.lpac.images
+        if images is None:
+            raise BundleError(f"bundle {self.manifest.name!r} has no perception (no {CNN})")
+        shape = (1, len(images.channels), images.size, images.size)
+        for name, expected in (("images", shape), ("position_feature", (2,))):
+            if problem := array_problem(name, inputs[name], expected):
+                raise ValueError(problem)
+        features = self.image_features(inputs["images"])[0]
+        return np.concatenate([features, inputs["position_feature"]])
+
+    def logged_step(
+        self, features: F32, neighbours: Neighbourhood, inputs: Mapping[str, F32]
+    ) -> PolicyStep:
+        """See `edge.policy.family.Replayable`."""
+        return self.step(features, neighbours, HopBuffer(self.geometry))
+
+    def step(self, features: F32, neighbours: Neighbourhood, hops: HopBuffer) -> PolicyStep:
+        """The action from x_i and the neighbours' Y_j, and the robot's own Y_i."""
+        hops.diffuse(neighbours.payloads, neighbours.degree)
+        [velocity] = self.velocity(features[None], hops)
+        return PolicyStep(velocity, hops.message(neighbours.degree))
+
 
 class LpacAgent:
     """See `edge.policy.family.Agent`; paper, section "Decentralized Graph Neural Networks"."""
@@ -56,11 +82,9 @@ class LpacAgent:
         features = np.concatenate([self._policy.image_features(images)[0], position])
         return Perceived(features, {"images": images.copy(), "position_feature": position})
 
-    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
-        """The action from x_i and the neighbours' Y_j, and the robot's own Y_i."""
-        self._hops.diffuse(payloads, degree)
-        [velocity] = self._policy.velocity(features[None], self._hops)
-        return PolicyStep(velocity, self._hops.message(degree))
+    def step(self, features: F32, neighbours: Neighbourhood) -> PolicyStep:
+        """See `LpacPolicy.step`."""
+        return self._policy.step(features, neighbours, self._hops)
 
     def reset(self) -> None:
         """Do nothing: no state is kept between steps."""

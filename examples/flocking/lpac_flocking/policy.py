@@ -14,7 +14,7 @@ import numpy.typing as npt
 from edge.core import F32, F64
 from edge.core.aggregation import Geometry, HopBuffer
 from edge.policy.bundle import Bundle, BundleError
-from edge.policy.family import GoldenCheck, Observation, Perceived, PolicyStep
+from edge.policy.family import GoldenCheck, Neighbourhood, Observation, Perceived, PolicyStep
 
 WEIGHTS, GOLDEN = "weights.npz", "golden.npz"
 # Pairs (x, y): the place in the world, the velocity, away from who is close, and to the others;
@@ -116,7 +116,11 @@ class FlockingAgent:
     def observe(self, observation: Observation) -> Perceived:
         return Perceived(features_of(observation, self._world_size, self._max_speed), {})
 
-    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+    def step(self, features: F32, neighbours: Neighbourhood) -> PolicyStep:
+        return self.decide(features, neighbours.payloads, neighbours.degree)
+
+    def decide(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+        """Step that needs no more of the neighbours than their payloads."""
         self._hops.diffuse(payloads, degree)
         [layer] = self._hops.layers
         layer[:, 0] = features
@@ -136,7 +140,7 @@ def swarm_velocities(
     for _ in range(policy.geometry.hops + 1):
         said = [step.payload for step in steps]
         steps = [
-            agent.step(
+            agent.decide(
                 features[i],
                 [said[j] for j in np.flatnonzero(adjacency[i])] if said else [],
                 degrees[i],

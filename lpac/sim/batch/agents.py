@@ -12,8 +12,8 @@ from edge.core.part import in_one_line
 from edge.core.perception import PerceptionParameters
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import Bundle
-from edge.policy.family import Observation, perceived_problem, step_problem
-from edge.policy.lpac.images import PolicyImages
+from edge.policy.family import Neighbourhood, Observation, perceived_problem, step_problem
+from edge.policy.images import PolicyImages
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 
 # Largest batch of the CNN: larger ones are no faster, and take more memory.
@@ -60,8 +60,7 @@ class Agents(Protocol):
         self,
         robots: Sequence[int],
         features: Sequence[F32],
-        payloads: Sequence[Sequence[F32]],
-        degrees: Sequence[int],
+        neighbours: Sequence[Neighbourhood],
     ) -> PolicySteps:
         """`Agent.step` of n distinct robots; payloads are float32, rounded as on the wire."""
 
@@ -110,15 +109,14 @@ class LpacAgents:
         self,
         robots: Sequence[int],
         features: Sequence[F32],
-        payloads: Sequence[Sequence[F32]],
-        degrees: Sequence[int],
+        neighbours: Sequence[Neighbourhood],
     ) -> PolicySteps:
         hops = HopBuffer(self._policy.geometry, len(robots))
-        for i, (received, degree) in enumerate(zip(payloads, degrees, strict=True)):
-            hops.diffuse(received, degree, i)
+        for i, each in enumerate(neighbours):
+            hops.diffuse(each.payloads, each.degree, i)
         velocities = self._policy.velocity(np.stack(features), hops)
-        messages = [hops.message(degree, i) for i, degree in enumerate(degrees)]
-        return PolicySteps(velocities, np.stack(messages))
+        payloads = [hops.message(each.degree, i) for i, each in enumerate(neighbours)]
+        return PolicySteps(velocities, np.stack(payloads))
 
     def reset(self, robot: int) -> None:
         """Do nothing: the agents have no memory."""
@@ -159,13 +157,12 @@ class SingleAgents:
         self,
         robots: Sequence[int],
         features: Sequence[F32],
-        payloads: Sequence[Sequence[F32]],
-        degrees: Sequence[int],
+        neighbours: Sequence[Neighbourhood],
     ) -> PolicySteps:
         steps = []
-        for robot, seen, received, degree in zip(robots, features, payloads, degrees, strict=True):
+        for robot, seen, each in zip(robots, features, neighbours, strict=True):
             try:
-                step = self._agents[robot].step(seen, received, degree)
+                step = self._agents[robot].step(seen, each)
             except Exception as error:
                 raise _failed(in_one_line(error)) from error
             if problem := step_problem(step, self.message_size):

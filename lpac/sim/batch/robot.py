@@ -21,7 +21,7 @@ from edge.core.shared_map import SharedMap
 from edge.core.wire import PayloadType, rounded
 from edge.flight.safety import limit_speed
 from edge.messages.beacon import Beacon
-from edge.policy.family import Observation
+from edge.policy.family import Neighbourhood, Observation
 from edge.robot.neighbours import NeighbourTable, Number
 from edge.robot.pac import PacParameters
 from lpac.sim.batch.agents import Agents, Inputs, PolicyFailedError
@@ -54,16 +54,17 @@ class DeferredFeatures:
 class DeferredStep:
     """A tick of a robot's policy: its inputs, and its outputs once computed.
 
-    Ticks between two perceptions share `features`. `used` are the neighbours' ticks whose
-    payloads it uses. `rank` is the length of the longest chain of steps to compute before it.
-    Before it is computed, `velocity` (2,) is None and `payload` (message_size,), as neighbours
-    receive it, is undefined; `largest` is the payload's largest absolute value.
+    Ticks between two perceptions share `features`. `used` are the neighbours' ticks, whose
+    payloads are those of `neighbours`. `rank` is the length of the longest chain of steps to
+    compute before it. Before it is computed, `velocity` (2,) is None and `payload`
+    (message_size,), as neighbours receive it, is undefined; `largest` is the payload's largest
+    absolute value.
     """
 
     robot: "BatchedRobot"
     features: DeferredFeatures
     used: "tuple[DeferredStep, ...]"
-    degree: int
+    neighbours: Neighbourhood
     rank: int
     payload: F32
     velocity: F32 | None = None
@@ -109,8 +110,7 @@ class DeferredSteps:
         velocities, payloads = self.agents.step(
             [step.robot.agent for step in steps],
             [step.features.values for step in steps],
-            [[other.payload for other in step.used] for step in steps],
-            [step.degree for step in steps],
+            [step.neighbours for step in steps],
         )
         received = np.empty_like(payloads)
         types = np.array([step.robot.payload for step in steps])
@@ -235,23 +235,31 @@ class BatchedRobot:
             self._deferred.add_features(self._features)
         odometry, own = self._own()
         # Read the neighbours before a swap that clears the table.
-        neighbours = self.table.neighbours(now_s) if self._swap_clears else ()
+        kept = self.table.neighbours(now_s) if self._swap_clears else ()
         received = self.table.swap(now_s)
-        near = self._in_range(own, [each.beacon for each in received])
+        positions = self._to_model([each.beacon for each in received])
+        near = neighbours_in_range(own, positions, self._perception.communication_range)
         degree = int(near.sum())
-        if neighbours:
-            degree = max(degree, int(self._in_range(own, [n.beacon for n in neighbours]).sum()))
-        used = tuple(
-            message.step
-            for (_, message, _), is_near in zip(received, near.tolist(), strict=True)
-            if is_near and isinstance(message, _Deferred)
+        if kept:
+            degree = max(degree, int(self._in_range(own, [each.beacon for each in kept]).sum()))
+        used = [each for each, is_near in zip(received, near.tolist(), strict=True) if is_near]
+        steps = tuple(message.step for _, message, _ in used if isinstance(message, _Deferred))
+        velocities_m_s = [each.beacon.velocity_m_s or (0.0, 0.0, 0.0) for each in used]
+        horizontal = np.array(velocities_m_s, np.float64).reshape(-1, 3)[:, :2]
+        neighbours = Neighbourhood(
+            robot_ids=tuple(each.beacon.robot_id for each in used),
+            payloads=tuple(step.payload for step in steps),
+            positions=(positions[near] - own).astype(np.float32),
+            velocities=self._parameters.scale.velocity_to_model(horizontal).astype(np.float32),
+            ages_s=np.array([now_s - each.sent_at_s for each in used], np.float32),
+            degree=degree,
         )
-        before = (*used, self._action) if self._action else used
+        before = (*steps, self._action) if self._action else steps
         step = DeferredStep(
             self,
             self._features,
-            used,
-            degree,
+            steps,
+            neighbours,
             max((other.rank + 1 for other in before if other.velocity is None), default=0),
             np.empty(self._deferred.agents.message_size, np.float32),
         )

@@ -1,12 +1,20 @@
 """Agents that replace a policy's own in simulation."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from edge.core import F32
 from edge.policy.bundle import Manifest
-from edge.policy.family import Agent, GoldenCheck, Observation, Perceived, Policy, PolicyStep
+from edge.policy.family import (
+    Agent,
+    GoldenCheck,
+    Neighbourhood,
+    Observation,
+    Perceived,
+    Policy,
+    PolicyStep,
+)
 from edge.policy.lpac.policy import LpacAgent
 
 
@@ -52,8 +60,8 @@ class DeferredAgent(LpacAgent):
         self._seen = observation
         return Perceived(np.zeros(0, np.float32), {})
 
-    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+    def step(self, features: F32, neighbours: Neighbourhood) -> PolicyStep:
         """Step on the last observation; `features` are ignored."""
         if self._seen is not None:
             self._features, self._seen = super().observe(self._seen).features, None
-        return super().step(self._features, payloads, degree)
+        return super().step(self._features, neighbours)

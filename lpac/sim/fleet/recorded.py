@@ -4,7 +4,7 @@ onnxruntime's results differ in the last bits between types of CPU, and the flig
 The flight logs hold the policies' outputs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from edge.core import F32
 from edge.core.part import PartError
 from edge.core.wire import Rejection, decode
 from edge.drivers.log_reader import read, read_metadata
-from edge.policy.family import Observation, Perceived, Policy, PolicyStep
+from edge.policy.family import Neighbourhood, Observation, Perceived, Policy, PolicyStep
 
 
 class RecordingError(ValueError):
@@ -32,7 +32,7 @@ class RecordedAgent:
         """Returns no features: its steps need none."""
         return Perceived(np.zeros(0, np.float32), {})
 
-    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+    def step(self, features: F32, neighbours: Neighbourhood) -> PolicyStep:
         """Recorded step at this time. Raises PartError if there is none."""
         return self._steps.at(self._unix_s())
 

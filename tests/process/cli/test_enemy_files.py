@@ -23,7 +23,7 @@ from mcap.writer import CompressionType, Writer
 from edge.drivers.flight_log import FlightLog, FlightMetadata
 from edge.drivers.log_reader import read
 from edge.policy.bundle import Bundle, load_bundle, make_bundle
-from edge.policy.lpac.manifest import GOLDEN
+from edge.policy.golden import GOLDEN
 from tests.conftest import ROOT, SHIPPED
 
 MOST_BYTES = 256e6

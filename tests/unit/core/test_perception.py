@@ -18,7 +18,7 @@ from edge.core.perception import (
     part_in_world,
     window_corner,
 )
-from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages, Resize, neighbour_maps, own_cell
+from edge.policy.images import MAP_CHANNELS, PolicyImages, Resize, neighbour_maps, own_cell
 
 PARAMETERS = PerceptionParameters(
     world_size=512, local_map_size=256, sensor_size=64, communication_range=256.0

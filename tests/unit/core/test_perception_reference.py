@@ -7,7 +7,7 @@ from edge.core import F32, F64
 from edge.core.memory import RobotMemory
 from edge.core.perception import PerceptionParameters, neighbours_in_range
 from edge.drivers.world_sensor import WorldSensor
-from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages
+from edge.policy.images import MAP_CHANNELS, PolicyImages
 from lpac.analysis.worlds import random_features
 from tests.unit.core.reference import point_vector, reference_environment
 

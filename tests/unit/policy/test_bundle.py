@@ -22,7 +22,8 @@ from edge.policy.bundle import (
     make_bundle,
     write_bundle,
 )
-from edge.policy.lpac.manifest import GOLDEN, LpacManifest
+from edge.policy.golden import GOLDEN
+from edge.policy.lpac.manifest import LpacManifest
 from edge.policy.lpac.policy import LpacPolicy
 
 GRAPHS = ("cnn.onnx", "gnn_1.onnx", "gnn_2.onnx", "action.onnx")

@@ -13,7 +13,7 @@ from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.messages.beacon import decode_beacon, encode_beacon
 from edge.policy.bundle import Bundle
-from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages
+from edge.policy.images import MAP_CHANNELS, PolicyImages
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 from edge.policy.lpac.verify import swarm_velocities
 from edge.robot.pac import Pac, PacParameters

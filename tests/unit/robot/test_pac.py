@@ -1,7 +1,7 @@
 """One robot's steps: what they do, and what they do when something is missing."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -19,7 +19,14 @@ from edge.core.ports import Look, Odometry
 from edge.core.wire import Rejection, decode, encode
 from edge.messages.beacon import Beacon, tag
 from edge.policy.bundle import Bundle, BundleError, Manifest
-from edge.policy.family import GoldenCheck, Observation, Perceived, Policy, PolicyStep
+from edge.policy.family import (
+    GoldenCheck,
+    Neighbourhood,
+    Observation,
+    Perceived,
+    Policy,
+    PolicyStep,
+)
 from edge.policy.lpac.policy import LpacPolicy
 from edge.robot.pac import Pac, PacParameters
 
@@ -325,6 +332,7 @@ class Watching:
     bundle_id: bytes = bytes(32)
     message_size: int = 0
     local_maps: list[F32] = field(default_factory=list)
+    neighbours: Neighbourhood | None = None
 
     def agent(self) -> "Watching":
         return self
@@ -336,7 +344,8 @@ class Watching:
         self.local_maps.append(observation.local_map.copy())
         return Perceived(np.zeros(2, np.float32), {})
 
-    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+    def step(self, features: F32, neighbours: Neighbourhood) -> PolicyStep:
+        self.neighbours = neighbours
         return PolicyStep(features, np.zeros(0, np.float32))
 
     def reset(self) -> None:
@@ -436,6 +445,33 @@ def test_a_policy_is_shown_what_is_unseen_if_its_manifest_asks(shipped_bundle: B
     np.testing.assert_array_equal(np.isnan(marked), ~seen & (np.arange(256) >= 128)[:, None])
     np.testing.assert_array_equal(np.nan_to_num(marked), plain)
     assert not plain[:128].any()  # outside the world
+
+
+def test_a_policy_knows_where_its_neighbours_are_and_how_old_their_messages(
+    shipped_bundle: Bundle,
+) -> None:
+    manifest = dataclasses.replace(shipped_bundle.manifest, family="watching", parameters={})
+    policy = Watching(manifest)
+    robot = make_robot(policy, World(position=(16.0, 16.0, 3.0)))
+    robot.clock.update(GROUND, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+    nothing = encode(AggregatedMessage(np.zeros(0, np.float32)), "float32")
+    for robot_id, x_m in ((7, 18.0), (3, 14.0), (9, 120.0)):
+        beacon = Beacon(
+            robot_id=robot_id, sent=FleetTime(GROUND, 0.1, 0.0), position_m=(x_m, 17.0, 3.0),
+            velocity_m_s=(0.5, -0.25, 0.1), frame_id=0, bundle_tag=tag(policy.bundle_id.hex()),
+        )  # fmt: skip
+        assert robot.receive(beacon, (1, 1), nothing, 0.2) is None
+    robot.perceive(0.2)
+    tick = robot.infer(0.5)
+    seen = policy.neighbours
+    assert seen is not None and tick is not None
+    assert seen.robot_ids == (3, 7) and seen.degree == 2
+    # 16 model units a metre, a quarter of the speed in the model: ModelScale(16, 0.25).
+    np.testing.assert_allclose(seen.positions, [[-32.0, 16.0], [32.0, 16.0]])
+    np.testing.assert_allclose(seen.velocities, np.tile([2.0, -1.0], (2, 1)))
+    np.testing.assert_allclose(seen.ages_s, 0.4, atol=0.02)
+    assert tick.senders == (3, 7)
+    np.testing.assert_array_equal(tick.positions, seen.positions)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from edge.core import F32, Bools
 from edge.core.schema import ConfigError
-from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages
+from edge.policy.images import MAP_CHANNELS, PolicyImages
 from edge.policy.lpac.manifest import LpacManifest
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 from export import network

@@ -14,7 +14,7 @@ from edge.core.schema import ConfigError
 from edge.core.wire import FLOAT_PAYLOADS
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import load_bundle
-from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
+from edge.policy.images import EXPLORED, MAP_CHANNELS
 from edge.policy.lpac.manifest import LpacManifest
 from lpac.sim.cores import Outcome, Task
 from lpac.study.worlds import FIELD, draw_world

@@ -1,0 +1,1 @@
+"""Policy family of any network: two ONNX graphs, `encode` and `step`."""
