@@ -15,7 +15,7 @@ class Schedule:
         self.epoch_s = epoch_s
         self._now_s = 0.0
         self._due: list[tuple[float, int, Callable[[], object]]] = []
-        self._asked = 0
+        self._count = 0
 
     def monotonic_s(self) -> float:
         """Time since the start, s."""
@@ -25,25 +25,25 @@ class Schedule:
         """Unix time, s."""
         return self.epoch_s + self._now_s
 
-    def at(self, time_s: float, do: Callable[[], object]) -> None:
+    def at(self, time_s: float, callback: Callable[[], object]) -> None:
         """Schedule a callback; a time in the past means now."""
-        self._asked += 1
-        heapq.heappush(self._due, (max(time_s, self._now_s), self._asked, do))
+        self._count += 1
+        heapq.heappush(self._due, (max(time_s, self._now_s), self._count, callback))
 
     def every(
-        self, period_s: float, do: Callable[[], object], after_s: float = 0.0
-    ) -> "Recurrence":
+        self, period_s: float, callback: Callable[[], object], after_s: float = 0.0
+    ) -> "Timer":
         """Schedule a callback after `after_s` and then every period, on absolute deadlines."""
-        recurrence = Recurrence(self, period_s, do, self._now_s + after_s)
-        self.at(recurrence.due_s, recurrence)
-        return recurrence
+        timer = Timer(self, period_s, callback, self._now_s + after_s)
+        self.at(timer.due_s, timer)
+        return timer
 
     def run_until(self, time_s: float) -> None:
         """Run all callbacks due until `time_s`, and advance the clock to it."""
         due = self._due
         while due and due[0][0] <= time_s:
-            self._now_s, _, do = heapq.heappop(due)
-            do()
+            self._now_s, _, callback = heapq.heappop(due)
+            callback()
         self._now_s = max(self._now_s, time_s)
 
 
@@ -63,26 +63,26 @@ class WallClock:
         return self._schedule.unix_s() + self.ahead_s
 
 
-class Recurrence:
+class Timer:
     """Periodic callback of a schedule, next at `due_s`."""
 
     def __init__(
-        self, schedule: Schedule, period_s: float, do: Callable[[], object], due_s: float
+        self, schedule: Schedule, period_s: float, callback: Callable[[], object], due_s: float
     ) -> None:
         self.due_s = due_s
         self._schedule = schedule
         self._period_s = period_s
-        self._do: Callable[[], object] | None = do
+        self._callback: Callable[[], object] | None = callback
         self._hangs_until_s = due_s
 
     def __call__(self) -> None:
         """Run the callback and schedule the next."""
-        if self._do is None:
+        if self._callback is None:
             return
         self.due_s += self._period_s
         self._schedule.at(self.due_s, self)
         if self._schedule.monotonic_s() >= self._hangs_until_s:
-            self._do()
+            self._callback()
 
     def hang(self, duration_s: float) -> None:
         """Skip the callbacks due within that time."""
@@ -90,4 +90,4 @@ class Recurrence:
 
     def stop(self) -> None:
         """Cancel all further callbacks."""
-        self._do = None
+        self._callback = None

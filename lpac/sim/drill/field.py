@@ -132,7 +132,7 @@ class FaultyFleet(ABC):
         """Lateness of this machine behind real time, s."""
         return 0.0
 
-    def happen(self, do: Do, hit: tuple[int, ...]) -> None:
+    def apply(self, do: Do, hit: tuple[int, ...]) -> None:
         """Apply an injection to its group of robots."""
         robots = robots_of(do.to, hit, self.layout.scenario.robots)
         match do.injection:
@@ -146,8 +146,8 @@ class FaultyFleet(ABC):
             case injection:
                 self.inject(injection, robots)
 
-    def noted(self, request: Request) -> Callable[[], None]:
-        """Record a command given now; call the result when it is answered."""
+    def record_order(self, request: Request) -> Callable[[], None]:
+        """Record a command given now; returns a callback for its answer."""
         index = len(self.orders)
         self.orders.append(
             GivenOrder(command_name(request), self._addressed(request), self.now_s(), math.inf)

@@ -85,7 +85,7 @@ def fly(field: FaultyFleet, fault: Fault, scenario: Scenario) -> Procedure[Timel
 def _command(field: FaultyFleet, request: Request) -> Procedure[None]:
     """Send a command, if the ground runs, and wait for its report or a timeout."""
     if field.ground_runs:
-        answered = field.noted(request)
+        answered = field.record_order(request)
         yield request
         answered()
 

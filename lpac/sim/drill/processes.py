@@ -125,7 +125,7 @@ class ProcessField(FaultyFleet):
         return self._ground.running
 
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
-        self._at(self.now_s() + after_s, partial(self.happen, do, hit))
+        self._at(self.now_s() + after_s, partial(self.apply, do, hit))
 
     def carry_out(self, procedure: Procedure[T]) -> T:
         """Run a procedure, which goes on after a command that times out.
@@ -239,9 +239,9 @@ class ProcessField(FaultyFleet):
             case _:
                 raise TypeError(f"{injection} is not done to a program")
 
-    def _at(self, at_s: float, happen: Callable[[], None]) -> None:
+    def _at(self, at_s: float, inject: Callable[[], None]) -> None:
         with self.stepped:
-            heapq.heappush(self._due, (at_s, next(self._count), happen))
+            heapq.heappush(self._due, (at_s, next(self._count), inject))
 
     def _run(self) -> None:
         def is_due() -> bool:
@@ -252,9 +252,9 @@ class ProcessField(FaultyFleet):
                 self.stepped.wait_for(is_due)
                 if self._over:
                     return
-                _, _, happen = heapq.heappop(self._due)
+                _, _, inject = heapq.heappop(self._due)
             try:
-                happen()
+                inject()
             except Exception as error:
                 self._failed = error
                 return

@@ -86,7 +86,7 @@ class SimulatedField(FaultyFleet):
         return self.fleet.schedule.unix_s()
 
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
-        self.fleet.schedule.at(self.now_s() + after_s, partial(self.happen, do, hit))
+        self.fleet.schedule.at(self.now_s() + after_s, partial(self.apply, do, hit))
 
     def all_down(self) -> bool:
         return all(

@@ -30,7 +30,7 @@ from lpac.sim.fleet.layout import Layout, Settings
 from lpac.sim.fleet.recorded import RecordedAgent, recorded_steps
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.scenario import Scenario
-from lpac.sim.schedule import Recurrence, Schedule, WallClock
+from lpac.sim.schedule import Timer, Schedule, WallClock
 
 # Default step of the vehicles' physics.
 VEHICLE_STEP_S = 0.02
@@ -77,7 +77,7 @@ class SimulatedRobot:
         self.watchdog: SimulatedWatchdog | None = None
         self._disk = _Disk()
         self._last_status: RobotStatus | None = None
-        self.loops: dict[str, Recurrence] = {}
+        self.loops: dict[str, Timer] = {}
         self._policy = policy
         self._sensor_over = sensor_over
         self._schedule = schedule

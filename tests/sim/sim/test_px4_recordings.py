@@ -331,9 +331,9 @@ def ready_s(real: list[Stamped]) -> float:
 
 def charges(real: list[Stamped]) -> list[tuple[float, Callable[[Px4Vehicle], object]]]:
     """Charge of the battery; SYS_STATUS rounds it up."""
-    charges = [(s.at_s, s.message.battery_remaining - 0.5) for s in real if s.name == "SYS_STATUS"]
-    times_s = np.arange(charges[0][0], charges[-1][0], 0.1)
-    remaining = np.interp(times_s, *np.array(charges).T) / 100.0
+    reported = [(s.at_s, s.message.battery_remaining - 0.5) for s in real if s.name == "SYS_STATUS"]
+    times_s = np.arange(reported[0][0], reported[-1][0], 0.1)
+    remaining = np.interp(times_s, *np.array(reported).T) / 100.0
     return [
         # PX4 reports it at once, and checks it up to a tenth of a second later.
         (float(at_s) + CHECKS_PERIOD_S, sets(battery_remaining=max(float(charge), 0.0)))
