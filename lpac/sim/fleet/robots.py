@@ -30,7 +30,7 @@ from lpac.sim.fleet.layout import Layout, Settings
 from lpac.sim.fleet.recorded import RecordedAgent, recorded_steps
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.scenario import Scenario
-from lpac.sim.schedule import Timer, Schedule, WallClock
+from lpac.sim.schedule import Schedule, Timer, WallClock
 
 # Default step of the vehicles' physics.
 VEHICLE_STEP_S = 0.02

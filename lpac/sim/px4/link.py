@@ -26,7 +26,7 @@ FORCE = 21196.0  # MAV_CMD_COMPONENT_ARM_DISARM: param 2 that skips the checks
 FIRMWARE_VERSION = 1 << 24 | 17 << 16 | 0 << 8 | 255  # 1.17.0, release
 PARAMETERS_AT_ONCE = 10
 MAX_DATAGRAM_BYTES = 1400
-# Texts are sent only if a ground station sent a heartbeat within this time, and up to this age.
+# Maximum age of a ground station's last heartbeat for texts to be sent, and of the texts.
 GROUND_STATION_TIMEOUT_S = 2.5
 TEXT_KEPT_S = 5.0
 TEXT_BYTES = 50
@@ -324,7 +324,7 @@ class Px4Link:
         )
 
     def _sys_status(self) -> Any:
-        """PREARM_CHECK is in the health bits alone, for the current mode by the last report."""
+        """The health bits alone have PREARM_CHECK: armable in this mode by the last report."""
         vehicle = self.vehicle
         report = vehicle.health
         present, healthy = 0, _NEVER_ILL

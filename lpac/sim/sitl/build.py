@@ -43,7 +43,7 @@ LISTEN_PORT = 14580
 CLIENT_PORT = 14540
 GROUND_PORT = 18570
 TRUTH_PORT = 19410
-_AIRBORNE_ABOVE_M = 0.15
+AIRBORNE_ABOVE_M = 0.15
 _STOP_WITHIN_S = 3.0
 _STATE_WITHIN_S = 30.0
 _MODEL, _AIRFRAME = "sihsim_quadx", "10040"
@@ -246,7 +246,7 @@ class Px4Build:
         """Track of one vehicle; without a complete log it has no modes and setpoints."""
         truth = read_truth(instance.logs(), self._world) if instance.clock else None
         if truth is not None:
-            airborne = truth.position_m[:, 2] < -_AIRBORNE_ABOVE_M
+            airborne = truth.position_m[:, 2] < -AIRBORNE_ABOVE_M
             time_s = instance.to_monotonic_s(truth.time_s)
             track = TrueTrack(time_s, truth.position_m, airborne)
             if not len(truth.status_s):
@@ -268,7 +268,7 @@ class Px4Build:
         with self._lock:
             places = tuple(instance.places)
         position_m = np.array([place.position_m for place in places]).reshape(-1, 3)
-        airborne = position_m[:, 2] < -_AIRBORNE_ABOVE_M
+        airborne = position_m[:, 2] < -AIRBORNE_ABOVE_M
         return TrueTrack(np.array([place.time_s for place in places]), position_m, airborne)
 
     def _start(self, instance: _Instance) -> None:

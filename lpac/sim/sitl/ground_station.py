@@ -20,9 +20,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from edge.core import F64
 from lpac.sim.px4.modes import CUSTOM_MODES, MODE_BY_CUSTOM, Px4Mode
 from lpac.sim.px4.world import WorldOrigin
-from lpac.sim.sitl.build import GROUND_PORT, Px4Build, frames
+from lpac.sim.sitl.build import AIRBORNE_ABOVE_M, GROUND_PORT, Px4Build, frames
 
-AIRBORNE_ABOVE_M = 0.15
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
 # PX4 loses a remote control after half a second, and accepts a pilot's mode only with one.
