@@ -212,19 +212,16 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "commander_failsafe_enter_generic": ("failsafe: PX4 {1}", "IA"),
     "commander_failsafe_enter_generic_hold": ("failsafe: PX4 holds for {2} s, then {1}", "IAH"),
     "commander_failsafe_enter_generic_warn": "failsafe: PX4 does nothing",
-    "commander_failsafe_enter_autopilot_disengaged": (
-        "failsafe: PX4 {1}, and no longer keeps its position", "IA",
-    ),
+    "commander_failsafe_enter_autopilot_disengaged":
+        ("failsafe: PX4 {1}, and no longer keeps its position", "IA"),
     "commander_failsafe_enter_low_bat": "battery low",
     "commander_failsafe_enter_crit_bat_warn": "battery critical: land",
     "commander_failsafe_enter_crit_low_bat_warn": "battery nearly empty: land",
-    "commander_failsafe_enter_low_flight_time_warn": (
-        "battery lasts for little more than the way home"
-    ),
+    "commander_failsafe_enter_low_flight_time_warn":
+        "battery lasts for little more than the way home",
     "commander_low_bat_shutdown": "battery empty: the autopilot switches itself off",
-    "commander_low_bat_shutdown_failed": (
-        "battery empty: the autopilot could not switch itself off"
-    ),
+    "commander_low_bat_shutdown_failed":
+        "battery empty: the autopilot could not switch itself off",
     "commander_kill_sw_engaged": "the kill switch is on",
     "commander_rc_lost": "remote control lost",
     "commander_rc_loss_act": "PX4 acts on a lost remote control",
@@ -254,34 +251,25 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "commander_unsupported_arm_disarm_param": "arming was requested with an unknown value",
     # Parameters that PX4 changes because they do not fit others
     "mc_pos_ctrl_tilt_set": ("PX4 set MPC_TILTMAX_AIR to {0:.0f} degrees: more is not safe", "f"),
-    "mc_pos_ctrl_land_tilt_set": (
-        "PX4 set MPC_TILTMAX_LND to {0:.0f} degrees, which is MPC_TILTMAX_AIR", "f",
-    ),
-    "mc_pos_ctrl_cruise_set": (
-        "PX4 set MPC_XY_CRUISE to {0:.1f} m/s, which is MPC_XY_VEL_MAX", "f",
-    ),
-    "mc_pos_ctrl_man_vel_set": (
-        "PX4 set MPC_VEL_MANUAL to {0:.1f} m/s, which is MPC_XY_VEL_MAX", "f",
-    ),
-    "mc_pos_ctrl_man_vel_back_set": (
-        "PX4 set MPC_VEL_MAN_BACK to {0:.1f} m/s, which is MPC_VEL_MANUAL", "f",
-    ),
-    "mc_pos_ctrl_man_vel_side_set": (
-        "PX4 set MPC_VEL_MAN_SIDE to {0:.1f} m/s, which is MPC_VEL_MANUAL", "f",
-    ),
-    "mc_pos_ctrl_up_vel_set": (
-        "PX4 set MPC_Z_V_AUTO_UP to {0:.1f} m/s, which is MPC_Z_VEL_MAX_UP", "f",
-    ),
-    "mc_pos_ctrl_down_vel_set": (
-        "PX4 set MPC_Z_V_AUTO_DN to {0:.1f} m/s, which is MPC_Z_VEL_MAX_DN", "f",
-    ),
-    "mc_pos_ctrl_hover_thrust_set": (
-        "PX4 set MPC_THR_HOVER to {0:.2f}: from MPC_THR_MIN to MPC_THR_MAX", "f",
-    ),
+    "mc_pos_ctrl_land_tilt_set":
+        ("PX4 set MPC_TILTMAX_LND to {0:.0f} degrees, which is MPC_TILTMAX_AIR", "f"),
+    "mc_pos_ctrl_cruise_set":
+        ("PX4 set MPC_XY_CRUISE to {0:.1f} m/s, which is MPC_XY_VEL_MAX", "f"),
+    "mc_pos_ctrl_man_vel_set":
+        ("PX4 set MPC_VEL_MANUAL to {0:.1f} m/s, which is MPC_XY_VEL_MAX", "f"),
+    "mc_pos_ctrl_man_vel_back_set":
+        ("PX4 set MPC_VEL_MAN_BACK to {0:.1f} m/s, which is MPC_VEL_MANUAL", "f"),
+    "mc_pos_ctrl_man_vel_side_set":
+        ("PX4 set MPC_VEL_MAN_SIDE to {0:.1f} m/s, which is MPC_VEL_MANUAL", "f"),
+    "mc_pos_ctrl_up_vel_set":
+        ("PX4 set MPC_Z_V_AUTO_UP to {0:.1f} m/s, which is MPC_Z_VEL_MAX_UP", "f"),
+    "mc_pos_ctrl_down_vel_set":
+        ("PX4 set MPC_Z_V_AUTO_DN to {0:.1f} m/s, which is MPC_Z_VEL_MAX_DN", "f"),
+    "mc_pos_ctrl_hover_thrust_set":
+        ("PX4 set MPC_THR_HOVER to {0:.2f}: from MPC_THR_MIN to MPC_THR_MAX", "f"),
     "ekf2_mag_type_invalid": "EKF2_MAG_TYPE is not valid: PX4 set its default",
-    "nf_delay_max_too_small": (
-        "PX4 set EKF2_DELAY_MAX to {1:.0f} ms, as its sensors need: restart the autopilot", "ff",
-    ),
+    "nf_delay_max_too_small":
+        ("PX4 set EKF2_DELAY_MAX to {1:.0f} ms, as its sensors need: restart the autopilot", "ff"),
     "ekf2_aid_mask_gps": "EKF2_AID_MASK is obsolete: PX4 set EKF2_GPS_CTRL",
     "ekf2_aid_mask_ev": "EKF2_AID_MASK is obsolete: PX4 set EKF2_EV_CTRL",
     "ekf2_aid_mask_imu": "EKF2_AID_MASK is obsolete: PX4 set EKF2_IMU_CTRL",
@@ -292,9 +280,8 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "ekf2_hgt_ref_rng": "PX4 set EKF2_RNG_CTRL, as EKF2_HGT_REF needs",
     "ekf2_hgt_ref_gps": "PX4 set EKF2_GPS_CTRL, as EKF2_HGT_REF needs",
     "ekf2_hgt_ref_ev": "PX4 set EKF2_EV_CTRL, as EKF2_HGT_REF needs",
-    "commander_airmode_requires_no_arm_gesture": (
-        "MC_AIRMODE with yaw does not go with arming by the sticks (MAN_ARM_GESTURE)"
-    ),
+    "commander_airmode_requires_no_arm_gesture":
+        "MC_AIRMODE with yaw does not go with arming by the sticks (MAN_ARM_GESTURE)",
     # Faults on the ground, or without effect on the flight
     "commander_load_param_failed": "its settings could not be loaded",
     "commander_save_param_failed": "its settings could not be saved",
@@ -306,18 +293,14 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "mavlink_log_not_enough_bw": ("the link is too slow to send PX4's log: {0} B/s", "I"),
     "mavlink_param_rc_chan_out_of_bounds": "a parameter was mapped to a missing channel",
     "col_prev_unsup_frame": ("obstacles arrived in an unknown frame ({0})", "B"),
-    "mavlink_rcv_lnd_target_unsup_coord": (
-        "a landing target arrived in an unknown frame ({0})", "B",
-    ),
-    "mavlink_rcv_odom_unsup_estimator_type": (
-        "odometry arrived from an unknown estimator ({0})", "B",
-    ),
-    "mavlink_rcv_sp_target_unsup_coord": (
-        "a setpoint arrived in an unknown frame ({0})", "B",
-    ),
-    "mavlink_rcv_sp_target_gl_invalid_coord": (
-        "a setpoint arrived in an unknown frame ({0})", "B",
-    ),
+    "mavlink_rcv_lnd_target_unsup_coord":
+        ("a landing target arrived in an unknown frame ({0})", "B"),
+    "mavlink_rcv_odom_unsup_estimator_type":
+        ("odometry arrived from an unknown estimator ({0})", "B"),
+    "mavlink_rcv_sp_target_unsup_coord":
+        ("a setpoint arrived in an unknown frame ({0})", "B"),
+    "mavlink_rcv_sp_target_gl_invalid_coord":
+        ("a setpoint arrived in an unknown frame ({0})", "B"),
     "mavlink_rcv_sp_target_invalid": "a setpoint had no position, velocity or acceleration",
     "mavlink_rcv_sp_target_unsup_force": "setpoints of a force are not supported",
     "mavlink_rcv_sp_target_gl_unsup_force": "setpoints of a force are not supported",
