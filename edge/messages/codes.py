@@ -88,16 +88,6 @@ class CheckCode(_Code):
     WORLD_UNUSABLE = "world_unusable"
 
 
-# Codes for the ground's fence, world or origin that a robot does not adopt.
-FENCE_NOT_TAKEN = (
-    CheckCode.KEEPS_FENCE,
-    CheckCode.FENCE_OR_PLACE_UNFIT,
-    CheckCode.FENCE_OUT_OF_REACH,
-)
-WORLD_NOT_TAKEN = (CheckCode.KEEPS_WORLD, CheckCode.WORLD_NOT_ARRIVED, CheckCode.WORLD_UNUSABLE)
-ORIGIN_NOT_TAKEN = (CheckCode.KEEPS_ORIGIN, CheckCode.ORIGIN_OUT_OF_REACH)
-
-
 @dataclass(frozen=True, slots=True)
 class FailedCheck:
     """A failed check, which keeps a robot on the ground; `text` says what to do.
@@ -185,14 +175,6 @@ class ReasonCode(_Code):
     NOT_A_MEMBER = "not_a_member"
     MEMBERS_DIFFER = "members_differ"
     GROUND_NOT_UNDERSTOOD = "ground_not_understood"
-
-
-# Alarms about the battery.
-BATTERY_REASONS = (
-    ReasonCode.BATTERY_CRITICAL,
-    ReasonCode.BATTERY_LOW,
-    ReasonCode.BATTERY_NOT_KNOWN,
-)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,7 @@ from typing import Literal, NamedTuple
 from edge.core.arrivals import Arrivals
 from edge.core.counted import counted
 from edge.flight.preflight import PreflightLimits
-from edge.messages.codes import (
-    BATTERY_REASONS,
-    FENCE_NOT_TAKEN,
-    ORIGIN_NOT_TAKEN,
-    WORLD_NOT_TAKEN,
-    CheckCode,
-    texts,
-)
+from edge.messages.codes import CheckCode, ReasonCode, texts
 from edge.messages.mission import AIRBORNE, FlightState, RobotStatus
 from lpac.analysis.commonest import commonest
 from lpac.analysis.snapshot import COMMANDER_SILENT_S, FleetSetup, FleetSnapshot, RobotSnapshot
@@ -28,7 +21,12 @@ SEVERITIES: tuple[Severity, ...] = ("critical", "warning", "note")
 # Age of the earlier snapshot.
 _HISTORY_S = 2.0
 
-_S = FlightState
+_S, _C, _R = FlightState, CheckCode, ReasonCode
+# Codes for the ground's fence, world or origin that a robot does not adopt.
+FENCE_NOT_TAKEN = (_C.KEEPS_FENCE, _C.FENCE_OR_PLACE_UNFIT, _C.FENCE_OUT_OF_REACH)
+_WORLD_NOT_TAKEN = (_C.KEEPS_WORLD, _C.WORLD_NOT_ARRIVED, _C.WORLD_UNUSABLE)
+_ORIGIN_NOT_TAKEN = (_C.KEEPS_ORIGIN, _C.ORIGIN_OUT_OF_REACH)
+_BATTERY_REASONS = (_R.BATTERY_CRITICAL, _R.BATTERY_LOW, _R.BATTERY_NOT_KNOWN)
 # States in which a robot uses the others' messages.
 _USES_OTHERS = (_S.HOLD, _S.MISSION, _S.RETURN)
 # The defaults: a robot's own configuration may differ.
@@ -293,7 +291,7 @@ def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
 
 def _battery(fleet: _Fleet, seen: _Seen) -> _Found:
     battery = seen.status.battery
-    reported = any(alarm.code in BATTERY_REASONS for alarm in seen.status.alarms)
+    reported = any(alarm.code in _BATTERY_REASONS for alarm in seen.status.alarms)
     if reported or battery is None or battery > BATTERY_LOW:
         return None
     if not is_flying(seen.status):
@@ -312,13 +310,13 @@ def _bundle(fleet: _Fleet, seen: _Seen) -> _Found:
 
 def _world(fleet: _Fleet, seen: _Seen) -> _Found:
     theirs, ours = seen.status.world_id, fleet.world
-    if theirs == ours or _reports(seen, WORLD_NOT_TAKEN):
+    if theirs == ours or _reports(seen, _WORLD_NOT_TAKEN):
         return None
     return "warning", f"world {theirs[:ID] or 'none'}, not the fleet's {ours[:ID]}"
 
 
 def _origin(fleet: _Fleet, seen: _Seen) -> _Found:
-    if seen.status.origin in (None, fleet.origin) or _reports(seen, ORIGIN_NOT_TAKEN):
+    if seen.status.origin in (None, fleet.origin) or _reports(seen, _ORIGIN_NOT_TAKEN):
         return None
     return "warning", "its origin is not the fleet's"
 

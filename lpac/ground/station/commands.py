@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Collection, Generator, Iterable
 from typing import Any
 
-from edge.messages.codes import FENCE_NOT_TAKEN, ReasonCode, Refusal, RefusalCode, texts
+from edge.messages.codes import ReasonCode, Refusal, RefusalCode, texts
 from edge.messages.mission import (
     AT_SLOT_M,
     FlightState,
@@ -18,6 +18,7 @@ from edge.messages.mission import (
     world_id,
 )
 from lpac.analysis.snapshot import COMMANDER_SILENT_S, NO_STATE
+from lpac.ground.alarms import FENCE_NOT_TAKEN
 from lpac.ground.rendering import NOT_HEARD, missing_checks, state_and_reason
 from lpac.ground.station.protocol import (
     CommandProgress,
