@@ -105,10 +105,9 @@ def load_identity(
 
     A start's number is the wall clock, ms, or the last number plus one if the clock is behind it:
     others accept messages only from increasing starts. `lpac fleet up` resets a number that a wrong
-    clock left far in the future. If the number cannot be saved, the start
-    goes on, and `Identity.update` tries again and raises the error. With `robot_id` the identity
-    must be that robot's. A robot that is not in the list of members starts, too: it may be in the
-    air.
+    clock left far in the future. If the number cannot be saved, the start goes on, and
+    `Identity.update` tries again and raises the error. With `robot_id` the identity must be that
+    robot's. A robot that is not in the list of members starts, too: it may be in the air.
 
     Raises ConfigError, one line, if the folder's content cannot be used; OSError.
     """

@@ -9,12 +9,10 @@ import math
 import select
 import socket
 import time
-from collections import Counter
 from contextlib import suppress
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from typing import Self
 
-from edge.core.logger import log
 from edge.core.wire import MAX_ROBOT_ID
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID, ZenohLink
 from edge.identity.envelope import read_head
@@ -71,8 +69,6 @@ class MulticastLink:
         self._claimed_at_s = -math.inf
         self._greatest_id = MAX_CERTIFIED_ID if group.is_secret else MAX_ROBOT_ID
         self._admission = Admission(_MOST_BUDGETS)
-        self._lock = Lock()
-        self._failures: Counter[str] = Counter()
         self._strangers = 0
         self._sender = _sender()
         self._closed = Event()
@@ -101,7 +97,7 @@ class MulticastLink:
             for datagram in datagrams(data, sender=self._robot_id, key=key):
                 self._sender.sendto(datagram, (self._group.address, self._group.port))
         except (OSError, ValueError) as error:  # no network, a full queue, or too large a message
-            self._failed("publish", error)
+            self._zenoh.report_failure("publish", error)
 
     def is_claimed(self, robot_id: int) -> bool:
         """Whether another program uses that robot id."""
@@ -129,7 +125,7 @@ class MulticastLink:
                 with _receiver(self._group) as receiver:
                     self._receive(receiver)
             except Exception as error:  # no network yet, or anything else: try again
-                self._failed("receive from the group", error)
+                self._zenoh.report_failure("receive from the group", error)
                 self._closed.wait(_JOIN_RETRY_S)
 
     def _receive(self, receiver: socket.socket) -> None:
@@ -180,7 +176,7 @@ class MulticastLink:
         try:
             is_authentic = self._on_message(key, message)
         except Exception as error:
-            self._failed("callback", error)
+            self._zenoh.report_failure("callback", error)
             return
         if is_authentic is not False:
             self._assembly.confirm(fragment, now_s)
@@ -193,13 +189,6 @@ class MulticastLink:
         start = fragment.number.start
         is_start = start <= self._own_start if self._group.is_secret else start == self._own_start
         return fragment.sender == self._robot_id and is_start
-
-    def _failed(self, what: str, error: Exception) -> None:
-        with self._lock:
-            self._failures[what] += 1
-            first = self._failures[what] == 1
-        if first:
-            log.error("link failure", exc_info=error, what=what)
 
 
 def _sender() -> socket.socket:

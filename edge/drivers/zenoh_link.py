@@ -159,7 +159,7 @@ class ZenohLink:
         try:
             publisher.put(data)
         except zenoh.ZError as error:
-            self._failed(f"publish {topic.name}", error)
+            self.report_failure(f"publish {topic.name}", error)
 
     def is_claimed(self, robot_id: int) -> bool:
         """Whether another session uses that robot id.
@@ -203,7 +203,7 @@ class ZenohLink:
         try:
             self._session.close()  # type: ignore[no-untyped-call]
         except zenoh.ZError as error:
-            self._failed("close", error)
+            self.report_failure("close", error)
 
     def _knock(
         self, members: Knocking, connect: Sequence[str], opened: Sequence[zenoh.Session]
@@ -267,11 +267,12 @@ class ZenohLink:
                 if admitted:
                     callback(key, sample.payload.to_bytes())
             except Exception as error:
-                self._failed(f"callback {topic.pattern}", error)
+                self.report_failure(f"callback {topic.pattern}", error)
 
         return receive
 
-    def _failed(self, what: str, error: Exception) -> None:
+    def report_failure(self, what: str, error: Exception) -> None:
+        """Log the first failure of each kind."""
         with self._lock:
             self._failures[what] += 1
             first = self._failures[what] == 1

@@ -133,8 +133,8 @@ def guide(
     )
     memory = Guidance(np.array([*safe_m_s[:2], 0.0]), recovering)
     if state is FlightState.RETURN:
-        return MissionPosition(_vector(position_m + safe_m_s * _AHEAD_S)), memory
-    return MissionVelocity(_vector(safe_m_s)), memory
+        return MissionPosition(vector(position_m + safe_m_s * _AHEAD_S)), memory
+    return MissionVelocity(vector(safe_m_s)), memory
 
 
 def _stay(robot: Robot, flight: FlightMemory, height_m: float) -> MissionVelocity:
@@ -160,7 +160,7 @@ def _towards(
     height = float(position_m[2])
     wanted_m = min(target_m[2], highest_m)
     climb_m = hold_height(height, wanted_m, limits.max_climb_m_s) * _AHEAD_S
-    return MissionPosition(_vector(np.array([*place_m, height + climb_m])))
+    return MissionPosition(vector(np.array([*place_m, height + climb_m])))
 
 
 def _hold(
@@ -233,6 +233,7 @@ def _return_velocity(robot: Robot, inputs: FlightInputs, position_m: F64) -> F64
     return offset_m * (speed_m_s / max(distance_m, 1e-9))
 
 
-def _vector(values: F64) -> Vector:
+def vector(values: F64) -> Vector:
+    """The numbers of an array (3,)."""
     x, y, z = values.tolist()
     return x, y, z

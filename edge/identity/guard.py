@@ -31,8 +31,8 @@ from edge.identity.replay_window import NO_NUMBER, MessageNumber, ReplayWindow
 from edge.identity.signature import Signer
 from edge.messages.topics import HOLD, Link, ReceiveCallback, Topic, robot_id_in
 
-# Messages in transit when a member's program restarted have arrived by then.
-_LONGEST_TRANSIT_S = 5.0
+# After a cut, TCP delivers data that is up to 2 s old; nothing is in transit longer than this.
+LONGEST_TRANSIT_S = 5.0
 _MOST_NAMED = 4
 # A wrong time zone sets a clock ahead by less than this; a clock that lost its time is behind.
 _MOST_AHEAD_MS = 24 * 3600e3
@@ -96,7 +96,7 @@ class _Stream:
         self.newest_s, self.members = now_s, head.members
         if not self.history or now_s - self.history[-1][0] >= 1.0:
             self.history.append((now_s, number))
-        while len(self.history) > 1 and now_s - self.history[1][0] > _LONGEST_TRANSIT_S:
+        while len(self.history) > 1 and now_s - self.history[1][0] > LONGEST_TRANSIT_S:
             self.history.popleft()
 
     def record_late(self, number: MessageNumber, now_s: float) -> None:
@@ -104,14 +104,14 @@ class _Stream:
 
         Only the program that started last is accepted.
         """
-        if now_s - self.late_s > _LONGEST_TRANSIT_S:
+        if now_s - self.late_s > LONGEST_TRANSIT_S:
             self.late_since_s, self.late = now_s, NO_NUMBER
         if number <= self.late:
             return
         self.late_s, self.late = now_s, number
         accepted = [*self.history, (self.newest_s, self.window.number)]
-        settled = [n for at_s, n in accepted if now_s - at_s > _LONGEST_TRANSIT_S]
-        persists = now_s - self.late_since_s > _LONGEST_TRANSIT_S
+        settled = [n for at_s, n in accepted if now_s - at_s > LONGEST_TRANSIT_S]
+        persists = now_s - self.late_since_s > LONGEST_TRANSIT_S
         if persists and settled and number <= settled[-1]:
             self.duplicate_s = now_s
 
@@ -303,7 +303,7 @@ class SignedGuard(Guard):
 
     def members_differ(self) -> str:
         """See `Guard`."""
-        since_s, members = self._clock_s() - _LONGEST_TRANSIT_S, self.members
+        since_s, members = self._clock_s() - LONGEST_TRANSIT_S, self.members
         newest: dict[bytes, _Stream] = {}
         with self._lock:
             for (key, _), stream in self._streams.items():
@@ -326,7 +326,7 @@ class SignedGuard(Guard):
 
     def duplicate_robots(self) -> frozenset[int]:
         """See `Guard`."""
-        since_s = self._clock_s() - _LONGEST_TRANSIT_S
+        since_s = self._clock_s() - LONGEST_TRANSIT_S
         with self._lock:
             streams = self._streams.items()
             recent = {key for (key, _), stream in streams if stream.newest_s >= since_s}
@@ -337,7 +337,7 @@ class SignedGuard(Guard):
 
     def robots_with_future_start(self) -> frozenset[int]:
         """See `Guard`."""
-        since_s = self._clock_s() - _LONGEST_TRANSIT_S
+        since_s = self._clock_s() - LONGEST_TRANSIT_S
         with self._lock:
             return self._robots(
                 {key for key, at_s in self._future_start_s.items() if at_s >= since_s}

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.core import F64
 from edge.core.frames import LocalTransform, MissionFrame, m_per_deg
 from edge.core.ports import Odometry, Vehicle
 from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
-from edge.core.vehicle import GlobalOrigin, Position, Setpoint, Vector, VehicleState, Velocity
-from edge.flight.guidance import MissionPosition, MissionSetpoint
+from edge.core.vehicle import GlobalOrigin, Position, Setpoint, VehicleState, Velocity
+from edge.flight.guidance import MissionPosition, MissionSetpoint, vector
 
 # A dozen missing positions at 20 Hz.
 MAX_POSITION_AGE_S = 0.6
@@ -76,10 +75,10 @@ class Navigation:
             return None
         if not self._is_known(vehicle):
             return None
-        x_m, y_m, z_m = _vector(transform.local_to_mission(np.array(position_m)))
+        x_m, y_m, z_m = vector(transform.local_to_mission(np.array(position_m)))
         return Odometry(
             (x_m, y_m, z_m - vehicle.height_jumped_m),
-            _vector(transform.velocity_to_mission(np.array(velocity_m_s))),
+            vector(transform.velocity_to_mission(np.array(velocity_m_s))),
         )
 
     def place_in(self, frame: MissionFrame, vehicle: VehicleState) -> tuple[float, float] | None:
@@ -88,7 +87,7 @@ class Navigation:
         if origin is None or position_m is None or not self._is_known(vehicle):
             return None
         transform = frame.relative_to(*origin)
-        x_m, y_m, _ = _vector(transform.local_to_mission(np.array(position_m)))
+        x_m, y_m, _ = vector(transform.local_to_mission(np.array(position_m)))
         return x_m, y_m
 
     def global_deg(self, vehicle: VehicleState) -> tuple[float, float] | None:
@@ -117,8 +116,8 @@ class Navigation:
                 return Velocity((0.0, 0.0, 0.0))
             x_m, y_m, height_m = setpoint.position_m
             place_m = np.array([x_m, y_m, height_m + self.datum_m + vehicle.height_jumped_m])
-            return Position(_vector(transform.mission_to_local(place_m)))
-        return Velocity(_vector(transform.velocity_to_local(np.array(setpoint.velocity_m_s))))
+            return Position(vector(transform.mission_to_local(place_m)))
+        return Velocity(vector(transform.velocity_to_local(np.array(setpoint.velocity_m_s))))
 
     def _is_known(self, vehicle: VehicleState) -> bool:
         age_s = self._clock_s() - vehicle.position_at_s
@@ -132,8 +131,3 @@ class Navigation:
             fixed = _Fixed(frame, origin, frame.relative_to(*origin))
             self._fixed = fixed
         return fixed.transform
-
-
-def _vector(values: F64) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z

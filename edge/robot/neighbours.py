@@ -15,10 +15,8 @@ from edge.core.aggregation import AggregatedMessage
 from edge.core.arrivals import Arrivals
 from edge.core.schema import NonNegative, require
 from edge.core.wire import Rejection
+from edge.identity.guard import LONGEST_TRANSIT_S
 from edge.messages.beacon import Beacon, ReceivedBeacon
-
-# After a cut, TCP delivers data that is up to 2 s old; nothing is in transit longer than this.
-_LONGEST_TRANSIT_S = 5.0
 
 # Validity of a beacon, from its arrival.
 BEACON_LASTS_S = 3.0
@@ -78,7 +76,7 @@ class NeighbourTable:
         # A robot without a battery-backed clock may restart with a smaller start, and a stranger
         # may have sent a greater number in its name. After a silence longer than any transit, each
         # beacon is accepted again, and each policy's message of another start.
-        self._restart_silence_s = max(max_message_age_s, _LONGEST_TRANSIT_S)
+        self._restart_silence_s = max(max_message_age_s, LONGEST_TRANSIT_S)
         self._lock = Lock()
         # By robot id, ascending. Never removed: a late duplicate must not pass for a new message.
         self._robots: dict[int, _Robot] = {}
