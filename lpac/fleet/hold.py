@@ -60,10 +60,10 @@ async def overview(session: Session, config: FleetConfig) -> dict[str, Any]:
         name: {"id": ids[name], "image": images.get(name), "starts": name in starts}
         for name in sorted(ids, key=_number, reverse=True)
     }
-    current, pending = output["current"].rpartition("/")[2], _object(output["pending"])
+    current, pending = output["current"].rpartition("/")[2], json_object(output["pending"])
     earlier = earlier_than(current, releases)
     return {
-        "identity": _object(output["identity"]),
+        "identity": json_object(output["identity"]),
         "machine": output["machine"],
         "sudo": bool(output["sudo"]),
         "current": ids.get(current),
@@ -71,7 +71,7 @@ async def overview(session: Session, config: FleetConfig) -> dict[str, Any]:
         "earlier": ids[earlier] if earlier and {current, earlier} <= starts else None,
         "pending": pending and ids.get(pending["release"], pending["release"]),
         "releases": releases,
-        "versions": _object(output["versions"]),
+        "versions": json_object(output["versions"]),
         "robot_toml": output["robot_toml"].partition(" ")[0] or None,
         "service": await session.call("service"),
         "unix_time_s": float(output["unix_time_s"]),
@@ -97,7 +97,7 @@ def _number(name: str) -> int:
     return int(name) if name.isdigit() else 0
 
 
-def _object(text: str) -> dict[str, Any] | None:
+def json_object(text: str) -> dict[str, Any] | None:
     """Parse a JSON object; None if it is not one."""
     try:
         found = json.loads(text)

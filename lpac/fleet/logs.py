@@ -7,6 +7,7 @@ from datetime import datetime
 from typing import NamedTuple
 
 from lpac.fleet.execute import execute
+from lpac.fleet.hold import json_object
 from lpac.fleet.session import RemoteError, as_root
 from lpac.fleet.settings import FleetConfig, RobotHost
 
@@ -65,11 +66,11 @@ def readable(entry: Entry) -> str:
 
 
 def _readable_text(text: str) -> str:
-    event = _structured(text)
-    if event is None:
+    event = json_object(text)
+    if event is None or "event" not in event:
         return text
     event.pop("timestamp", None)
-    words = [str(event.pop("level", "")), str(event.pop("event", ""))]
+    words = [str(event.pop("level", "")), str(event.pop("event"))]
     exception = event.pop("exception", None)
     words += [f"{key}={_value(value)}" for key, value in event.items()]
     line = " ".join(word for word in words if word)
@@ -77,15 +78,4 @@ def _readable_text(text: str) -> str:
 
 
 def _value(value: object) -> str:
-    text = value if isinstance(value, str) else json.dumps(value)
-    return json.dumps(text) if " " in text and isinstance(value, str) else text
-
-
-def _structured(text: str) -> dict[str, object] | None:
-    if not text.startswith("{"):
-        return None
-    try:
-        event = json.loads(text)
-    except ValueError:
-        return None
-    return event if isinstance(event, dict) and "event" in event else None
+    return value if isinstance(value, str) and " " not in value else json.dumps(value)

@@ -6,7 +6,7 @@ import socket
 import stat
 import tempfile
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Iterator
-from contextlib import aclosing, contextmanager
+from contextlib import AbstractContextManager, aclosing, contextmanager
 from pathlib import Path
 
 from lpac.ground.station.protocol import (
@@ -62,11 +62,9 @@ def command(
     raise AssertionError("answers end with a report or an error")
 
 
-@contextmanager
-def subscribe(fleet: str) -> Iterator[Iterator[ServerMessage]]:
+def subscribe(fleet: str) -> AbstractContextManager[Iterator[ServerMessage]]:
     """Messages of the ground process from now on. Raises GroundError, also when it ends."""
-    with _connected(fleet, SUBSCRIBE) as messages:
-        yield messages
+    return _connected(fleet, SUBSCRIBE)
 
 
 async def send(fleet: str, request: Request) -> CommandReport:
@@ -78,11 +76,9 @@ async def send(fleet: str, request: Request) -> CommandReport:
     raise AssertionError("answers end with a report or an error")
 
 
-async def listen(fleet: str) -> AsyncIterator[ServerMessage]:
+def listen(fleet: str) -> AsyncIterator[ServerMessage]:
     """`subscribe` for asyncio."""
-    async with aclosing(_answers(fleet, SUBSCRIBE)) as messages:
-        async for message in messages:
-            yield message
+    return _answers(fleet, SUBSCRIBE)
 
 
 @contextmanager
