@@ -87,14 +87,14 @@ class NetworkOptions:
 
 @app.command()
 @options_of(NetworkOptions)
-def network(of: NetworkOptions) -> None:
+def network(options: NetworkOptions) -> None:
     """Run the paper's network experiments: a bulk stream's throughput beside the programs."""
     from lpac.middleware.results import as_json as to_json
     from lpac.train.files import write_atomically
 
-    chosen = _checked(of.middlewares)
-    plans = [_plan(experiment, chosen, of) for experiment in _experiments(of.experiments)]
-    places = _places(of.namespaces, max(plan.places for plan in plans))
+    chosen = _checked(options.middlewares)
+    plans = [_plan(experiment, chosen, options) for experiment in _experiments(options.experiments)]
+    places = _places(options.namespaces, max(plan.places for plan in plans))
     where = _measured_on(places, plans[0])
     runs: list[Run] = []
     with closing(_measure(plans, places)) as measured:
@@ -102,12 +102,12 @@ def network(of: NetworkOptions) -> None:
             runs.append(run)
             # An interrupted measurement keeps its results.
             text = json.dumps(to_json(where, runs), indent=2)
-            write_atomically(of.out / "network.json", f"{text}\n".encode())
-    _draw(runs, of.out)
-    if of.as_json:
+            write_atomically(options.out / "network.json", f"{text}\n".encode())
+    _draw(runs, options.out)
+    if options.as_json:
         typer.echo(json.dumps(to_json(where, runs), indent=2))
     else:
-        _show(where, runs, of.out)
+        _show(where, runs, options.out)
 
 
 def _experiments(given: Sequence[str] | None) -> list["Experiment"]:
@@ -139,11 +139,13 @@ def _checked(given: Sequence[str] | None) -> tuple[str, ...]:
     return (*chosen, NOTHING)
 
 
-def _plan(experiment: "Experiment", middlewares: tuple[str, ...], of: NetworkOptions) -> "Plan":
+def _plan(
+    experiment: "Experiment", middlewares: tuple[str, ...], options: NetworkOptions
+) -> "Plan":
     from lpac.middleware.measure import Plan
 
     robots, repetitions, seconds = _RESTARTS if experiment == "restarts" else _ROBOTS
-    fleet = robots if of.robots is None else of.robots
+    fleet = robots if options.robots is None else options.robots
     least = 2 if experiment == "restarts" else 1
     if fleet < least:
         raise ValueError(f"--robots {fleet}: {experiment} needs at least {least}")
@@ -151,8 +153,8 @@ def _plan(experiment: "Experiment", middlewares: tuple[str, ...], of: NetworkOpt
         experiment=experiment,
         middlewares=middlewares,
         robots=(fleet,) if experiment == "restarts" else tuple(range(1, fleet + 1)),
-        repetitions=of.repetitions or repetitions,
-        seconds=of.seconds or seconds,
+        repetitions=options.repetitions or repetitions,
+        seconds=options.seconds or seconds,
     )
 
 
@@ -267,21 +269,21 @@ _LEGEND = (
     "after: time from a restart until half of all pairs, and the last, hear each other again; "
     "never: pairs that did not before the next restart; busy: this machine's processors"
 )
-_DELIVERED = ("delivered, %", lambda of: _number(of.measures.get("delivered"), 100.0))
-_THROUGHPUT = ("Mbit/s", lambda of: _number(of.measures["throughput_mbit_s"]))
-_BUSY = ("busy, %", lambda of: f"{100.0 * of.measures['processor'].mean:.0f}")
+_DELIVERED = ("delivered, %", lambda each: _number(each.measures.get("delivered"), 100.0))
+_THROUGHPUT = ("Mbit/s", lambda each: _number(each.measures["throughput_mbit_s"]))
+_BUSY = ("busy, %", lambda each: f"{100.0 * each.measures['processor'].mean:.0f}")
 _Columns = tuple[tuple[str, Callable[["Summary"], str]], ...]
 _RESTART_COLUMNS: _Columns = (
     _THROUGHPUT, _DELIVERED,
-    ("heard after, s", lambda of: _number(of.measures.get("heard_again_p50_s"), digits=2)),
-    ("the last, s", lambda of: _number(of.measures.get("heard_again_max_s"), digits=2)),
-    ("never, %", lambda of: _number(of.measures.get("never_heard"), 100.0)),
-    _BUSY, ("runs", lambda of: str(of.measures["throughput_mbit_s"].runs)),
+    ("heard after, s", lambda each: _number(each.measures.get("heard_again_p50_s"), digits=2)),
+    ("the last, s", lambda each: _number(each.measures.get("heard_again_max_s"), digits=2)),
+    ("never, %", lambda each: _number(each.measures.get("never_heard"), 100.0)),
+    _BUSY, ("runs", lambda each: str(each.measures["throughput_mbit_s"].runs)),
 )  # fmt: skip
 _CURVE_COLUMNS: _Columns = (
-    ("robots", lambda of: str(of.robots)), _THROUGHPUT,
-    ("age p50, ms", lambda of: _number(of.measures.get("age_p50_ms"))),
-    ("p99, ms", lambda of: _number(of.measures.get("age_p99_ms"))), _DELIVERED, _BUSY,
+    ("robots", lambda each: str(each.robots)), _THROUGHPUT,
+    ("age p50, ms", lambda each: _number(each.measures.get("age_p50_ms"))),
+    ("p99, ms", lambda each: _number(each.measures.get("age_p99_ms"))), _DELIVERED, _BUSY,
 )  # fmt: skip
 
 
@@ -289,7 +291,7 @@ def _print_summaries(columns: _Columns, summaries: "Sequence[Summary]") -> None:
     from lpac.middleware.figures import title_of
 
     names = [name for name, _ in columns]
-    rows = [[title_of(of.middleware), *(cell(of) for _, cell in columns)] for of in summaries]
+    rows = [[title_of(each.middleware), *(cell(each) for _, cell in columns)] for each in summaries]
     print_table(("", *names), rows, names)
 
 

@@ -132,7 +132,7 @@ class ConditionOptions:
 
 @app.command()
 @options_of(EvaluateOptions, ConditionOptions)
-def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
+def evaluate(options: EvaluateOptions, extra: ConditionOptions) -> None:
     """Compare policies and baselines over many worlds, with confidence intervals."""
     given = options.methods or [str(DEFAULT_BUNDLE)]
     for path in (part for text in given for part in text.split(",") if "/" in part):
@@ -141,13 +141,13 @@ def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
     from lpac.study.study import Study
     from lpac.study.worlds import SET_UPS, WORLD_SETS
 
-    _check(options, hard, given)
-    calibrated = calibration(hard.wifi, transport=bool(hard.transports))
+    _check(options, extra, given)
+    calibrated = calibration(extra.wifi, transport=bool(extra.transports))
     names = tuple(SET_UPS) if options.transfer else options.set_ups or ["field"]
     conditions = [
-        condition_of({"set_up": name, "duration_s": hard.duration, **change}, "lpac evaluate")
+        condition_of({"set_up": name, "duration_s": extra.duration, **change}, "lpac evaluate")
         for name in names
-        for change in _changes(hard, calibrated)
+        for change in _changes(extra, calibrated)
     ]
     study = Study(
         methods=_methods(given, options.baselines),
@@ -159,26 +159,26 @@ def evaluate(options: EvaluateOptions, hard: ConditionOptions) -> None:
     sources = {name: source._asdict() for name, source in calibrated.sources.items()}
     task = StudyTask(
         name="evaluation", study=study, folder=options.out, compared=options.compare,
-        further={"wifi_from": sources if hard.transports else None},
+        further={"wifi_from": sources if extra.transports else None},
     )  # fmt: skip
     fly_study(task, options.ray, as_json=options.as_json)
-    if hard.transports and not options.as_json:
+    if extra.transports and not options.as_json:
         typer.echo("\n".join(["what the model assumes of the Wi-Fi:", *wifi_lines(calibrated)]))
 
 
-def _check(options: EvaluateOptions, hard: ConditionOptions, given: Sequence[str]) -> None:
+def _check(options: EvaluateOptions, extra: ConditionOptions, given: Sequence[str]) -> None:
     """Raise ValueError for impossible options."""
     from edge.core.wire import PAYLOAD_TYPES
     from lpac.study.study import BASELINES
     from lpac.study.worlds import SET_UPS, WORLD_SETS
 
-    check_px4(hard.vehicle, options.px4)
-    require_here(hard.vehicle, options.ray)
+    check_px4(extra.vehicle, options.px4)
+    require_here(extra.vehicle, options.ray)
     if options.compare and len(given) != 2:
         raise ValueError(f"--compare needs two methods; {len(given)} given")
-    if hard.losses and hard.transports:
+    if extra.losses and extra.transports:
         raise ValueError("--loss and --transport: the model of --transport decides what is lost")
-    if options.transfer and hard.vehicle is not VehicleKind.POINT:
+    if options.transfer and extra.vehicle is not VehicleKind.POINT:
         raise ValueError("--transfer has teams that do not fly whole: choose others with --set-up")
     if options.transfer and options.set_ups:
         raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
@@ -186,7 +186,7 @@ def _check(options: EvaluateOptions, hard: ConditionOptions, given: Sequence[str
         ("--set", [options.world_set], WORLD_SETS),
         ("--baseline", options.baselines, BASELINES),
         ("--set-up", options.set_ups, tuple(SET_UPS)),
-        ("--payload", hard.payloads, PAYLOAD_TYPES),
+        ("--payload", extra.payloads, PAYLOAD_TYPES),
     ):
         for name in chosen or ():
             if name not in known:
@@ -206,28 +206,28 @@ def _methods(given: Sequence[str], baselines: Sequence[str] | None) -> "tuple[Me
     return (*methods, *(Method.of(name) for name in wanted if name not in named))
 
 
-def _changes(hard: ConditionOptions, calibrated: "Calibration") -> list[dict[str, Any]]:
+def _changes(extra: ConditionOptions, calibrated: "Calibration") -> list[dict[str, Any]]:
     """Keys of each condition, as in a study's file; the first is the usual condition."""
     from edge.core.wire import PAYLOAD_TYPES
 
     wifi = asdict(calibrated.wifi)
     lossy: list[dict[str, Any]] = [
-        *({"loss": loss} for loss in hard.losses or ()),
+        *({"loss": loss} for loss in extra.losses or ()),
         *(
             {"radio": {"transport": transport, "wifi": wifi}}
-            for transport in dict.fromkeys(hard.transports or ())
+            for transport in dict.fromkeys(extra.transports or ())
         ),
     ]
-    payloads = [name for name in PAYLOAD_TYPES if name in (hard.payloads or ())]
-    whole: list[dict[str, Any]] = [{"from_pads": True}, {"engine": hard.vehicle.value}]
+    payloads = [name for name in PAYLOAD_TYPES if name in (extra.payloads or ())]
+    whole: list[dict[str, Any]] = [{"from_pads": True}, {"engine": extra.vehicle.value}]
     return [
         {},
         *lossy,
-        *({"lost": robots} for robots in hard.lost or ()),
-        *({"lag_s": lag_s} for lag_s in hard.lags or ()),
-        *({"position_error_m": error_m} for error_m in hard.position_errors or ()),
+        *({"lost": robots} for robots in extra.lost or ()),
+        *({"lag_s": lag_s} for lag_s in extra.lags or ()),
+        *({"position_error_m": error_m} for error_m in extra.position_errors or ()),
         *({"payload": payload, **loss} for payload in payloads for loss in ({}, *lossy)),
-        *(whole if hard.vehicle is not VehicleKind.POINT else ()),
+        *(whole if extra.vehicle is not VehicleKind.POINT else ()),
     ]
 
 

@@ -44,7 +44,7 @@ _LOCK_BYTES = 80
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OfFleet:
+class FleetOptions:
     """Options of a command for robots of a fleet."""
 
     fleet: Fleet = DEFAULT_FLEET

@@ -52,23 +52,23 @@ def replay(
 ) -> None:
     """Recompute policy and flight decisions from flight logs, and print differences."""
     with working("replaying the logs"):
-        of = _replay(logs, bundle)
-    for gap in of.missing:
+        result = _replay(logs, bundle)
+    for gap in result.missing:
         typer.echo(f"lpac: {gap}", err=True)
     if as_json:
-        typer.echo(json.dumps(_described(of), indent=2))
+        typer.echo(json.dumps(_described(result), indent=2))
     else:
-        for c in of.comparisons:
+        for c in result.comparisons:
             typer.echo(
                 f"{c.name:12} {c.ticks:7,} ticks, {c.differing:,} differ, "
                 f"largest difference {c.largest_difference:g}"
             )
-        _print_flights(of.flights, of.metadata)
-    problems = _problems(of)
+        _print_flights(result.flights, result.metadata)
+    problems = _problems(result)
     if problems:
         raise ValueError("; ".join(problems))
     if not as_json:
-        _print_equal(of)
+        _print_equal(result)
 
 
 def _replay(logs: list[Path], bundle: Path | None) -> _Replay:
@@ -76,42 +76,44 @@ def _replay(logs: list[Path], bundle: Path | None) -> _Replay:
 
     metadata = _metadata(logs)
     missing = list[LogGap]()
-    of = _Replay(metadata, None, (), _flights(metadata, missing), missing)
+    result = _Replay(metadata, None, (), _flights(metadata, missing), missing)
     if _has_policy_ticks(metadata):
         policy_bundle, comparisons = _policy(metadata, bundle)
-        return of._replace(bundle=policy_bundle, comparisons=comparisons)
-    if not of.has_flight:
+        return result._replace(bundle=policy_bundle, comparisons=comparisons)
+    if not result.has_flight:
         raise ValueError(f"{', '.join(map(str, logs))}: no policy ticks: the policy never ran")
-    return of
+    return result
 
 
-def _print_equal(of: _Replay) -> None:
+def _print_equal(result: _Replay) -> None:
     """Print the result of a replay without differences."""
-    if of.bundle is not None:
+    if result.bundle is not None:
         found = "computes what it computed in flight"
-        if not of.comparisons:
+        if not result.comparisons:
             found = "was not replayed: only policies of the family lpac are"
-        typer.echo(f"{of.bundle.manifest.name} {of.bundle.id[:12]}: {found}")
-    if of.has_flight:
-        skipped = sum(flight.passed_over for flight in of.flights.values())
+        typer.echo(f"{result.bundle.manifest.name} {result.bundle.id[:12]}: {found}")
+    if result.has_flight:
+        skipped = sum(flight.passed_over for flight in result.flights.values())
         but = f", except {skipped:,} ticks that were skipped" if skipped else ""
         typer.echo(f"flight: decides what it decided in flight{but}")
 
 
-def _problems(of: _Replay) -> list[str]:
+def _problems(result: _Replay) -> list[str]:
     """Differences from the flight, and damaged logs."""
     problems = []
-    differing = [c for c in of.comparisons if c.differing]
+    differing = [c for c in result.comparisons if c.differing]
     if differing:
         offs = ", ".join(f"{c.name} by up to {c.largest_difference:g}" for c in differing)
         problems.append(f"not what was computed in flight: {offs}: {_ROUNDS}")
-    if ticks := sum(flight.differing for flight in of.flights.values()):
-        rounds = all(d.differing.is_rounding for f in of.flights.values() for d in f.differences)
+    if ticks := sum(flight.differing for flight in result.flights.values()):
+        rounds = all(
+            d.differing.is_rounding for f in result.flights.values() for d in f.differences
+        )
         problems.append(
             f"not what was decided in flight: {ticks:,} ticks differ"
             + (f" in the last digits alone: {_ROUNDS}" if rounds else "")
         )
-    damaged = sorted({gap.path.name for gap in of.missing if gap.damaged})
+    damaged = sorted({gap.path.name for gap in result.missing if gap.damaged})
     if damaged:
         problems.append(f"not all could be replayed: {', '.join(damaged)}: damaged")
     return problems
@@ -230,22 +232,22 @@ def _print_flights(
         )
 
 
-def _described(of: _Replay) -> dict[str, Any]:
+def _described(result: _Replay) -> dict[str, Any]:
     return {
-        "bundle": of.bundle and of.bundle.id,
-        "robots": sorted({each.robot_id for each in of.metadata.values()}),
-        "logs": [str(path) for path in of.metadata],
+        "bundle": result.bundle and result.bundle.id,
+        "robots": sorted({each.robot_id for each in result.metadata.values()}),
+        "logs": [str(path) for path in result.metadata],
         "outputs": {
             c.name: {
                 "ticks": c.ticks,
                 "differing": c.differing,
                 "largest_difference": _or_none(c.largest_difference),
             }
-            for c in of.comparisons
+            for c in result.comparisons
         },
-        "missing": [{**gap._asdict(), "path": str(gap.path)} for gap in of.missing],
+        "missing": [{**gap._asdict(), "path": str(gap.path)} for gap in result.missing],
         "flights": [
-            _flight(path, of.metadata[path], flight) for path, flight in of.flights.items()
+            _flight(path, result.metadata[path], flight) for path, flight in result.flights.items()
         ],
     }
 

@@ -43,25 +43,28 @@ class ReportOptions:
 
 @app.command()
 @options_of(ReportOptions)
-def report(of: ReportOptions) -> None:
+def report(options: ReportOptions) -> None:
     """Make figures and an HTML page from flight logs, and show how well missions repeat."""
     from lpac.analysis.examination import Wanted, examine
 
-    times_s = _times_s(of.times)
+    times_s = _times_s(options.times)
     wanted = Wanted(
-        missions=tuple(of.trial or ()), times_s=times_s, world=of.world, bundle=of.bundle
+        missions=tuple(options.trial or ()),
+        times_s=times_s,
+        world=options.world,
+        bundle=options.bundle,
     )
     with progress_of_run() as show:
 
         def on_progress(what: str, share: float) -> None:
             show(share, what, ())
 
-        examined = examine(of.folders, wanted, on_progress)
+        examined = examine(options.folders, wanted, on_progress)
         # Imported only when needed: matplotlib takes a second.
         from lpac.analysis.write_report import write
 
-        page = write(examined, of.out or of.folders[0] / "report", times_s, on_progress)
-    if of.as_json:
+        page = write(examined, options.out or options.folders[0] / "report", times_s, on_progress)
+    if options.as_json:
         typer.echo(json.dumps(examined.summary(), indent=2))
         return
     for record in examined.records:

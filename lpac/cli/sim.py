@@ -139,7 +139,7 @@ _NAMED = {"random_feature_count": "--features", "communication_range": "--range"
 _FLAGS = {**_NAMED, "failures": "--lost", "radio": "--transport", "clocks": "--policy-hz"}
 
 
-def _of_scenario() -> type[Any]:
+def _scenario_options() -> type[Any]:
     """Options that are a scenario's own fields."""
     from lpac.sim.scenario import Scenario
 
@@ -151,21 +151,21 @@ def _of_scenario() -> type[Any]:
 
 
 @app.command()
-@options_of(RunOptions, FlightOptions, _of_scenario())
-def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
+@options_of(RunOptions, FlightOptions, _scenario_options())
+def sim(run: RunOptions, flight: FlightOptions, scenario_options: Any) -> None:
     """Fly a swarm over an unknown world and print how well it covers it."""
     if run.vehicle is not VehicleKind.SIMULATED and run.recorded is not None:
         raise ValueError(f"--recorded does nothing with --vehicle {run.vehicle.value}")
     if run.vehicle not in IN_REAL_TIME and not run.script:
         raise ValueError(f"--no-script does nothing with --vehicle {run.vehicle.value}")
     check_px4(run.vehicle, run.px4)
-    count = _robot_count(drawn.robots, run.vehicle)
-    scenario = _scenario(run, drawn, of_scenario, count)
+    count = _robot_count(flight.robots, run.vehicle)
+    scenario = _scenario(run, flight, scenario_options, count)
     _require_able(scenario, run)
     if run.out:
         run.out.mkdir(parents=True, exist_ok=True)
     if run.vehicle is VehicleKind.POINT:
-        _warn_of_features_outside(drawn.world, scenario.features, run.bundle, scenario.world_size)
+        _warn_of_features_outside(flight.world, scenario.features, run.bundle, scenario.world_size)
         [record] = fly_showing([(scenario.controller, scenario)], run.bundle)
     elif run.vehicle is VehicleKind.SIMULATED:
         record = _fly_on_clock(scenario, run)
@@ -176,7 +176,7 @@ def sim(run: RunOptions, drawn: FlightOptions, of_scenario: Any) -> None:
             _serve(scenario, run, count)
             return
         record = _fly_programs(scenario, run, count)
-    _show(scenario, record, run, drawn)
+    _show(scenario, record, run, flight)
     if record.script.vehicle and (record.script.problem or not record.all_landed):
         raise typer.Exit(1)
 
@@ -208,7 +208,7 @@ def _require_able(scenario: "Scenario", run: RunOptions) -> None:
 
 
 def _scenario(
-    run: RunOptions, drawn: FlightOptions, of_scenario: Any, count: int | None
+    run: RunOptions, flight: FlightOptions, scenario_options: Any, count: int | None
 ) -> "Scenario":
     """Build the options' scenario, with one robot if `count` is None (auto).
 
@@ -220,38 +220,39 @@ def _scenario(
     from lpac.sim.description import FIELD_SCALE
     from lpac.sim.scenario import Scenario
 
-    is_point, world = run.vehicle is VehicleKind.POINT, drawn.world
+    is_point, world = run.vehicle is VehicleKind.POINT, flight.world
     robots = 1 if count is None else count
-    if world is not None and of_scenario.random_feature_count != Scenario().random_feature_count:
+    feature_count = scenario_options.random_feature_count
+    if world is not None and feature_count != Scenario().random_feature_count:
         raise ValueError(f"--features does nothing with --world {world}")
     features = parse_world(_text(world), str(world)) if world else None
-    require_something_to_cover(world, features, of_scenario.random_feature_count)
-    scale = FIELD_SCALE if drawn.scale is Scale.FIELD else ModelScale(1.0, 1.0)
-    radio, found = None, calibration(drawn.wifi, transport=is_point and drawn.transport is not None)
-    if is_point and drawn.transport is not None:
-        radio = ModelledRadio(drawn.transport, found.wifi)
+    require_something_to_cover(world, features, feature_count)
+    scale = FIELD_SCALE if flight.scale is Scale.FIELD else ModelScale(1.0, 1.0)
+    transport = flight.transport if is_point else None
+    found = calibration(flight.wifi, transport=transport is not None)
+    radio = None if transport is None else ModelledRadio(transport, found.wifi)
     scenario = Scenario(
         robots=robots,
         features=features,
         scale=scale,
         radio=radio,
-        failures=_failures(drawn, robots, of_scenario.duration_s),
-        clocks=_clocks(drawn),
-        transport=drawn.transport if drawn.transport and not is_point else "mesh",
-        **{name: getattr(of_scenario, name) for name in of_scenario.__dataclass_fields__},
+        failures=_failures(flight, robots, scenario_options.duration_s),
+        clocks=_clocks(flight),
+        transport=flight.transport if flight.transport and not is_point else "mesh",
+        **{name: getattr(scenario_options, name) for name in scenario_options.__dataclass_fields__},
     )
-    if drawn.starts is None:
+    if flight.starts is None:
         return scenario
-    return replace(scenario, starts_m=_starts(drawn.starts, count, run.bundle, scenario))
+    return replace(scenario, starts_m=_starts(flight.starts, count, run.bundle, scenario))
 
 
-def _failures(drawn: FlightOptions, robots: int, duration_s: float) -> tuple["Failure", ...]:
+def _failures(flight: FlightOptions, robots: int, duration_s: float) -> tuple["Failure", ...]:
     """Parse --lost and --away. Raises ValueError, also for times after the flight."""
     from lpac.sim.failure import Failure, LostRobots
 
-    failures = [Failure.parse(each) for each in drawn.away or ()]
-    if drawn.lost is not None:
-        failures += LostRobots.parse(drawn.lost).failures(robots)
+    failures = [Failure.parse(each) for each in flight.away or ()]
+    if flight.lost is not None:
+        failures += LostRobots.parse(flight.lost).failures(robots)
     for failure in failures:
         if failure.from_s >= duration_s:
             raise ValueError(
@@ -261,14 +262,14 @@ def _failures(drawn: FlightOptions, robots: int, duration_s: float) -> tuple["Fa
     return tuple(failures)
 
 
-def _clocks(drawn: FlightOptions) -> Any:
+def _clocks(flight: FlightOptions) -> Any:
     from lpac.sim.ticks import Clocks
 
     return Clocks(
-        perception_s=1.0 / drawn.perception_hz,
-        policy_s=1.0 / drawn.policy_hz,
-        control_s=1.0 / drawn.control_hz,
-        synchronous=drawn.synchronous,
+        perception_s=1.0 / flight.perception_hz,
+        policy_s=1.0 / flight.policy_hz,
+        control_s=1.0 / flight.control_hz,
+        synchronous=flight.synchronous,
     )
 
 
@@ -364,7 +365,7 @@ def _programs(run: RunOptions) -> Literal["mavlink", "px4"]:
 
 
 def _show(
-    scenario: "Scenario", record: "FlightRecord", run: RunOptions, drawn: FlightOptions
+    scenario: "Scenario", record: "FlightRecord", run: RunOptions, flight: FlightOptions
 ) -> None:
     from lpac.sim.flight_summary import summary, summary_lines
 
@@ -378,7 +379,7 @@ def _show(
     if record.script.vehicle:
         typer.echo("\n".join(summary_lines(scenario, record)))
     else:
-        _show_points(scenario, record, run.bundle, drawn)
+        _show_points(scenario, record, run.bundle, flight)
     if not run.out:
         return
     logged = any(program.logs for program in record.script.programs)
@@ -392,7 +393,7 @@ def _show(
 
 
 def _show_points(
-    scenario: "Scenario", record: "FlightRecord", bundle: Path, drawn: FlightOptions
+    scenario: "Scenario", record: "FlightRecord", bundle: Path, flight: FlightOptions
 ) -> None:
     from edge.core.counted import counted
     from lpac.sim.engines import loaded_bundle
@@ -407,7 +408,7 @@ def _show_points(
         )
     typer.echo(f"{flier}, {counted(scenario.robots, 'robot')}, seed {scenario.seed}: {result}")
     if scenario.radio is not None:
-        found = calibration(drawn.wifi, transport=True)
+        found = calibration(flight.wifi, transport=True)
         typer.echo(f"{scenario.radio.transport}: {scenario.link.in_words}; it assumes")
         typer.echo("\n".join(wifi_lines(found)))
 

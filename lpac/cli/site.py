@@ -18,7 +18,7 @@ from lpac.cli.ground_requests import (
     show,
     subscribe,
 )
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, FleetOptions, Robots
 from lpac.cli.printing import BAD, print_table, styled
 
 if TYPE_CHECKING:
@@ -47,8 +47,8 @@ class SiteOptions:
 
 
 @app.command()
-@options_of(SiteOptions, OfFleet)
-def save(site: SiteOptions, of: OfFleet) -> None:
+@options_of(SiteOptions, FleetOptions)
+def save(site: SiteOptions, options: FleetOptions) -> None:
     """Save origin, fence, and the present positions of the slots' robots as pads.
 
     Nothing is sent to the robots until `lpac site use NAME`.
@@ -57,13 +57,13 @@ def save(site: SiteOptions, of: OfFleet) -> None:
 
     if site.toward and not site.from_robot:
         raise ValueError("site save: --toward needs --from")
-    to = address(of.fleet, of.robots)
+    to = address(options.fleet, options.robots)
     sites = Sites(to.path)
     if not site.force:
         sites.require_new(site.name)
     saved = _as_it_stands(to, site)
     path = sites.save(site.name, saved)
-    if of.as_json:
+    if options.as_json:
         print_json({"site": site.name, "path": str(path), **dataclasses.asdict(saved)})
     else:
         _print_slots(saved)

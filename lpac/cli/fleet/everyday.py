@@ -16,7 +16,7 @@ import typer
 from lpac.cli.fields import options_of
 from lpac.cli.fleet.progress import print_json, print_results, require_all, run_all, run_for_each
 from lpac.cli.fleet.status import SHORT, flight, program
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots, open_fleet
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, FleetOptions, Robots, open_fleet
 from lpac.cli.printing import GOOD, styled, working
 
 if TYPE_CHECKING:
@@ -117,29 +117,30 @@ def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson =
     _control(config, chosen, "start", lambda at, _: program.start(at, config), as_json)
 
 
-@options_of(OfFleet)
-def stop(of: OfFleet, *, in_flight: InFlight = False) -> None:
+@options_of(FleetOptions)
+def stop(options: FleetOptions, *, in_flight: InFlight = False) -> None:
     """Stop the robots' programs, now and at every boot. A robot in flight refuses."""
     from lpac.fleet import program
 
-    config, chosen = open_fleet(of.fleet, of.robots)
+    config, chosen = open_fleet(options.fleet, options.robots)
     _control(
         config, chosen, "stop",
-        lambda at, robot: program.stop(at, robot, in_flight=in_flight, disable=True), of.as_json,
+        lambda at, robot: program.stop(at, robot, in_flight=in_flight, disable=True),
+        options.as_json,
     )  # fmt: skip
 
 
-@options_of(OfFleet)
-def restart(of: OfFleet, *, in_flight: InFlight = False) -> None:
+@options_of(FleetOptions)
+def restart(options: FleetOptions, *, in_flight: InFlight = False) -> None:
     """Stop the robots' programs and start them again. A robot in flight refuses."""
     from lpac.fleet import program
 
-    config, chosen = open_fleet(of.fleet, of.robots)
+    config, chosen = open_fleet(options.fleet, options.robots)
     chosen = _without_spares(config, chosen, "restarted")
 
     _control(
         config, chosen, "restart",
-        lambda at, robot: program.restart(at, config, robot, in_flight=in_flight), of.as_json,
+        lambda at, robot: program.restart(at, config, robot, in_flight=in_flight), options.as_json,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import typer
 
 from lpac.cli.fields import options_of
 from lpac.cli.fleet.progress import run_for_each
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet, Robots, open_fleet
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, FleetOptions, Robots, open_fleet
 from lpac.cli.printing import BAD, FAINT, GOOD, NOTABLE, print_notes, print_table, styled
 
 if TYPE_CHECKING:
@@ -141,9 +141,9 @@ def _require_none_failed(diagnoses: "Sequence[Diagnosis]") -> None:
         raise ValueError(f"{counted(count, 'check')} failed, on {', '.join(failed)}")
 
 
-@options_of(OfFleet)
+@options_of(FleetOptions)
 def up(
-    of: OfFleet,
+    options: FleetOptions,
     *,
     timeout: Annotated[float, typer.Option(help="How long to wait for the robots, s.")] = 40.0,
     trial: Annotated[
@@ -156,16 +156,16 @@ def up(
     """
     from lpac.fleet.up import batteries_of, combine_checks
 
-    config, chosen = open_fleet(of.fleet, of.robots)
+    config, chosen = open_fleet(options.fleet, options.robots)
     until_s = time.monotonic() + timeout
-    if of.robots is None:
+    if options.robots is None:
         chosen = _in_slots(config, chosen)
     results = _bring_up(config, chosen, until_s)
     came = [outcome.robot for outcome in results if outcome.value is not None]
     examinations = _examine(config, came)
     diagnoses = combine_checks(config, results, examinations)
     batteries = {pack.robot: pack for pack in batteries_of(config, examinations, trial)}
-    if of.as_json:
+    if options.as_json:
         described = _described(diagnoses)
         for diagnosis in diagnoses:
             reasons = diagnosis.reasons()

@@ -52,7 +52,7 @@ class EnrollOptions:
 
 
 @options_of(EnrollOptions)
-def enroll(of: EnrollOptions) -> None:
+def enroll(options: EnrollOptions) -> None:
     """Make a vehicle's computer a robot of the fleet; may be repeated at any time.
 
     It gets a key, an id, a place in the fleet's file as a spare, and a line in the list of members.
@@ -62,25 +62,25 @@ def enroll(of: EnrollOptions) -> None:
     """
     from lpac.fleet.settings import load_fleet
 
-    if of.name is None:
+    if options.name is None:
         for option in ("host", "user", "port", "address", "robot_id"):
-            if getattr(of, option) is not None:
+            if getattr(options, option) is not None:
                 flag = option if option == "host" else flag_of(option)
                 raise ValueError(f"{flag} is for one robot: give its name too")
-    names = list(load_fleet(of.fleet).robots) if of.name is None else [of.name]
+    names = list(load_fleet(options.fleet).robots) if options.name is None else [options.name]
     if not names:
-        raise ValueError(f"{of.fleet}: has no robots yet: give a name and an address")
+        raise ValueError(f"{options.fleet}: has no robots yet: give a name and an address")
     left = []
-    before = _members(of.fleet)
+    before = _members(options.fleet)
     try:
         for name in names:
             if len(names) > 1:
                 typer.echo(f"{name}:")
-            if steps := _enroll(name, of):
+            if steps := _enroll(name, options):
                 left.append(f"{name} is not ready: left to do: {', '.join(steps)}")
     finally:
-        if _members(of.fleet) != before:
-            send_list(load_fleet(of.fleet))
+        if _members(options.fleet) != before:
+            send_list(load_fleet(options.fleet))
     if left:
         raise ValueError("; ".join(left))
     are = "is" if len(names) == 1 else "are"
@@ -99,7 +99,7 @@ def _members(fleet: Path) -> bytes | None:
     return None if keys is None or not (keys / MEMBERS).exists() else (keys / MEMBERS).read_bytes()
 
 
-def _enroll(name: str, of: EnrollOptions) -> list[str]:
+def _enroll(name: str, options: EnrollOptions) -> list[str]:
     """Enroll a robot, print each step, and return those left to do."""
     from lpac.fleet.enroll import enroll as enroll_robot
     from lpac.fleet.setup import EnrollStep
@@ -116,9 +116,9 @@ def _enroll(name: str, of: EnrollOptions) -> list[str]:
 
     asyncio.run(
         enroll_robot(
-            of.fleet, name, of.host, user=of.user, port=of.port, address=of.address,
-            robot_id=of.robot_id, rename=of.yes, operator=user_at_host, on_step=on_step,
-            on_progress=_show_step,
+            options.fleet, name, options.host, user=options.user, port=options.port,
+            address=options.address, robot_id=options.robot_id, rename=options.yes,
+            operator=user_at_host, on_step=on_step, on_progress=_show_step,
         )
     )  # fmt: skip
     return left

@@ -21,7 +21,7 @@ from lpac.cli.ground_requests import (
 )
 from lpac.cli.mission.rehearse import rehearse
 from lpac.cli.mission.run import run
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, OfFleet
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, FleetOptions
 
 if TYPE_CHECKING:
     from edge.messages.mission import Origin
@@ -37,7 +37,7 @@ Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OfAll(OfFleet):
+class WholeFleetOptions(FleetOptions):
     """Options of a command for the whole fleet, which shares one origin, fence and world."""
 
     robots: Annotated[
@@ -50,7 +50,7 @@ class OfAll(OfFleet):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Named(OfFleet):
+class RobotsOptions(FleetOptions):
     """Options of a command for robots by name or by --robots; all robots by default."""
 
     names: Annotated[
@@ -59,14 +59,14 @@ class Named(OfFleet):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Landing(Named):
+class LandingOptions(RobotsOptions):
     """Options of a command that ends on the ground."""
 
     wait: Annotated[bool, typer.Option("--wait", help="Wait until all have landed.")] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OnlyNamed(Named):
+class NamedOptions(RobotsOptions):
     """Options of a command that requires robots to be named."""
 
     names: Annotated[
@@ -75,12 +75,12 @@ class OnlyNamed(Named):
     robots: Annotated[str | None, typer.Option("--robots", help="The same, such as r1,r3.")] = None
 
 
-def _named(of: Named, command: str) -> Addressed:
-    """Resolve names or --robots. Raises ValueError for both, or for neither with `OnlyNamed`."""
-    if of.names and of.robots is not None:
+def _named(options: RobotsOptions, command: str) -> Addressed:
+    """Resolve names or --robots. Raises ValueError for both, or if `NamedOptions` get neither."""
+    if options.names and options.robots is not None:
         raise ValueError("give the robots' names or --robots, not both")
-    to = address(of.fleet, ",".join(of.names) if of.names else of.robots)
-    if isinstance(of, OnlyNamed) and not to.robots:
+    to = address(options.fleet, ",".join(options.names) if options.names else options.robots)
+    if isinstance(options, NamedOptions) and not to.robots:
         raise ValueError(
             f"{command}: name the robots, such as `lpac mission {command} r3`: it is never for all"
         )
@@ -107,19 +107,19 @@ class OriginOptions:
 
 
 @app.command(context_settings=_NUMBERS)
-@options_of(OriginOptions, OfAll)
-def origin(given: OriginOptions, of: OfAll) -> None:
+@options_of(OriginOptions, WholeFleetOptions)
+def origin(given: OriginOptions, options: WholeFleetOptions) -> None:
     """Set the mission frame's origin: LAT LON HEADING_DEG, or a robot's pose (--from)."""
     from lpac.ground.station.protocol import SetOrigin
 
-    to = address(of.fleet, of.robots)
+    to = address(options.fleet, options.robots)
     where = _measured_origin(to, given) if given.from_robot else _given_origin(to, given)
     typer.echo(
         f"origin: {where.latitude_deg:.7f} {where.longitude_deg:.7f}, y axis {where.heading_deg:g} "
         "deg from north",
         err=True,
     )
-    ask(to, SetOrigin(where, to.robots), "origin", as_json=of.as_json)
+    ask(to, SetOrigin(where, to.robots), "origin", as_json=options.as_json)
 
 
 def _measured_origin(to: Addressed, given: OriginOptions) -> "Origin":
@@ -175,23 +175,23 @@ app.add_typer(fence)
 
 
 @fence.command("on")
-@options_of(OfAll)
-def fence_on(of: OfAll) -> None:
+@options_of(WholeFleetOptions)
+def fence_on(options: WholeFleetOptions) -> None:
     """Restore each robot's configured fence."""
     from lpac.ground.station.protocol import SetFence
 
-    to = address(of.fleet, of.robots)
-    ask(to, SetFence(None, to.robots), "fence on", as_json=of.as_json)
+    to = address(options.fleet, options.robots)
+    ask(to, SetFence(None, to.robots), "fence on", as_json=options.as_json)
 
 
 @fence.command("off")
-@options_of(OfAll)
-def fence_off(of: OfAll, *, yes: Yes = False) -> None:
+@options_of(WholeFleetOptions)
+def fence_off(options: WholeFleetOptions, *, yes: Yes = False) -> None:
     """Widen the fence to a square of 200 m around the origin. Asks first."""
     from lpac.ground.site import WIDE_FENCE_M, wide_fence
     from lpac.ground.station.protocol import SetFence
 
-    to = address(of.fleet, of.robots)
+    to = address(options.fleet, options.robots)
     confirm(
         f"Let all robots of fleet {to.fleet} fly {WIDE_FENCE_M / 2:g} m far from the origin?",
         "fence off",
@@ -199,13 +199,13 @@ def fence_off(of: OfAll, *, yes: Yes = False) -> None:
     )
     with subscribe(to) as subscriber:
         wide = wide_fence(subscriber.setup.fence)
-    ask(to, SetFence(wide, to.robots), "fence off", as_json=of.as_json)
+    ask(to, SetFence(wide, to.robots), "fence off", as_json=options.as_json)
 
 
 @fence.command("set", context_settings=_NUMBERS)
-@options_of(OfAll)
+@options_of(WholeFleetOptions)
 def fence_set(
-    of: OfAll,
+    options: WholeFleetOptions,
     *,
     corners: Annotated[
         list[str], typer.Argument(metavar="X,Y...", help="Corners in the mission frame, m.")
@@ -223,7 +223,7 @@ def fence_set(
     from edge.core.fence import Fence as Polygon
     from lpac.ground.station.protocol import SetFence
 
-    to = address(of.fleet, of.robots)
+    to = address(options.fleet, options.robots)
     points = tuple(_point(corner) for corner in corners)
     with subscribe(to) as subscriber:
         configured = subscriber.setup.fence
@@ -236,7 +236,7 @@ def fence_set(
         )
     except ValueError as error:
         raise ValueError(f"fence set: {error}") from None
-    ask(to, SetFence(polygon, to.robots), "fence set", as_json=of.as_json)
+    ask(to, SetFence(polygon, to.robots), "fence set", as_json=options.as_json)
 
 
 def _point(text: str) -> "Point":
@@ -248,9 +248,9 @@ def _point(text: str) -> "Point":
 
 
 @app.command()
-@options_of(OfAll)
+@options_of(WholeFleetOptions)
 def world(
-    of: OfAll,
+    options: WholeFleetOptions,
     *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A CoverageControl world file.")],
 ) -> None:
@@ -259,16 +259,16 @@ def world(
     from lpac.ground.script import read_world
     from lpac.ground.station.protocol import SetWorld
 
-    to = address(of.fleet, of.robots)
+    to = address(options.fleet, options.robots)
     text = read_world(file)
     typer.echo(f"world: {file.name}, {world_id(text)}", err=True)
-    ask(to, SetWorld(text, file.name, to.robots), "world", as_json=of.as_json)
+    ask(to, SetWorld(text, file.name, to.robots), "world", as_json=options.as_json)
 
 
 @app.command()
-@options_of(OfFleet)
+@options_of(FleetOptions)
 def assign(
-    of: OfFleet,
+    options: FleetOptions,
     *,
     site: Annotated[
         str, typer.Option("--site", help="Its pads; else those of the site in use.")
@@ -285,7 +285,7 @@ def assign(
     from lpac.ground.station.protocol import SetPlaces
     from lpac.ground.station.subscriber import addressed
 
-    to = address(of.fleet, of.robots)
+    to = address(options.fleet, options.robots)
     with subscribe(to) as subscriber:
         setup, ground = subscriber.setup, subscriber.snapshot.ground
         names = addressed(setup, to.robots)
@@ -301,21 +301,21 @@ def assign(
         name: {"pad": on_pad.height, "m": round(on_pad.distance_m, 2)}
         for name, on_pad in assigned.items()
     }
-    ask(to, SetPlaces(places), "assign", as_json=of.as_json, details=details)
+    ask(to, SetPlaces(places), "assign", as_json=options.as_json, details=details)
 
 
-def _add(name: str, about: str, options: type[Named] = Named) -> None:
+def _add(name: str, about: str, kind: type[RobotsOptions] = RobotsOptions) -> None:
     """Add a command that sends one request to robots."""
 
-    @options_of(options)
-    def command(of: Named) -> None:
+    @options_of(kind)
+    def command(options: RobotsOptions) -> None:
         from lpac.ground.station.protocol import SafetyCommand, of_robots
 
-        to = _named(of, name)
+        to = _named(options, name)
         request = of_robots(name, to.robots)
-        if isinstance(of, Landing) and isinstance(request, SafetyCommand):
-            request = replace(request, wait=of.wait)
-        ask(to, request, name, as_json=of.as_json)
+        if isinstance(options, LandingOptions) and isinstance(request, SafetyCommand):
+            request = replace(request, wait=options.wait)
+        ask(to, request, name, as_json=options.as_json)
 
     app.command(name, help=about)(command)
 
@@ -325,9 +325,9 @@ _add("disable", "Forbid the robots to fly; those in the air hold.")
 
 
 @app.command()
-@options_of(Named)
+@options_of(RobotsOptions)
 def takeoff(
-    of: Named,
+    options: RobotsOptions,
     *,
     interval: Annotated[
         float, typer.Option("--interval", min=0, max=60, help="Between two robots, s.")
@@ -343,62 +343,66 @@ def takeoff(
     """
     from lpac.ground.station.protocol import Takeoff
 
-    to = _named(of, "takeoff")
+    to = _named(options, "takeoff")
     who = ", ".join(to.robots) or f"all robots of fleet {to.fleet}"
     confirm(
         f"Start the motors of {who}, and take off?",
         "takeoff",
         yes=yes or not sys.stdin.isatty(),
     )
-    ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=of.as_json)
+    ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=options.as_json)
 
 
 _add("start", "Fly the mission, from hold.")
 _add("hold", "Hold position. Any ground station may command it.")
 _add("resume", "Cancel hold, return or land; robots that flew the mission fly it again.")
-_add("land", "Land at the present position.", Landing)
+_add("land", "Land at the present position.", LandingOptions)
 _add(
     "return",
     "Fly to the landing points at their own heights, and land there, the lowest first.",
-    Landing,
+    LandingOptions,
 )
 _add(
     "pilot", "Hand robots to human pilots, by name: the program commands nothing until `rejoin`.",
-    OnlyNamed,
+    NamedOptions,
 )  # fmt: skip
-_add("rejoin", "Take robots back from their pilots, by name: they hold; then `start`.", OnlyNamed)
+_add(
+    "rejoin",
+    "Take robots back from their pilots, by name: they hold; then `start`.",
+    NamedOptions,
+)
 
 
 @app.command()
-@options_of(Named)
-def disarm(of: Named) -> None:
+@options_of(RobotsOptions)
+def disarm(options: RobotsOptions) -> None:
     """Stop the motors on the ground. A robot in the air refuses."""
     from lpac.ground.station.protocol import RobotCommand
     from lpac.ground.station.subscriber import addressed
 
-    to = _named(of, "disarm")
+    to = _named(options, "disarm")
     names = to.robots
     if not names:
         with subscribe(to) as subscriber:
             names = addressed(subscriber.setup, ())
-    ask(to, RobotCommand("disarm", names), "disarm", as_json=of.as_json)
+    ask(to, RobotCommand("disarm", names), "disarm", as_json=options.as_json)
 
 
 @app.command()
-@options_of(OnlyNamed)
-def kill(of: OnlyNamed, *, yes: Yes = False) -> None:
+@options_of(NamedOptions)
+def kill(options: NamedOptions, *, yes: Yes = False) -> None:
     """Stop the motors at once, also in the air: THE ROBOTS FALL. Asks first."""
     from lpac.ground.station.protocol import RobotCommand
 
-    to = _named(of, "kill")
+    to = _named(options, "kill")
     confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
-    ask(to, RobotCommand("kill", to.robots), "kill", as_json=of.as_json)
+    ask(to, RobotCommand("kill", to.robots), "kill", as_json=options.as_json)
 
 
 @app.command()
-@options_of(OfFleet)
+@options_of(FleetOptions)
 def again(
-    of: OfFleet,
+    options: FleetOptions,
     *,
     trial: Annotated[
         str, typer.Argument(metavar="[TRIAL]", help="Its name; else the next number.")
@@ -407,8 +411,8 @@ def again(
     """Begin the next trial: robots discard explored maps and neighbours' messages."""
     from lpac.ground.station.protocol import NextTrial
 
-    to = address(of.fleet, of.robots)
-    ask(to, NextTrial(trial, to.robots), "again", as_json=of.as_json)
+    to = address(options.fleet, options.robots)
+    ask(to, NextTrial(trial, to.robots), "again", as_json=options.as_json)
 
 
 @app.command()
