@@ -47,8 +47,8 @@ class Columns:
 def log_arrays(path: Path | str, *topics: str) -> dict[str, dict[str, Columns]]:
     """Read a log, or all logs below a folder: log's name -> topic -> columns.
 
-    A log's name is its files' without their number, such as "robot-3"; these are joined in order.
-    With `topics` only these are read, which is faster, and each log has all of them.
+    A log's name is that of its files without their number, such as "robot-3"; files are joined in
+    order. With `topics` only these are read, which is faster, and each log has all of them.
 
     Raises ValueError if there are no logs, FlightLogError (a ValueError) for an invalid file,
     OSError. In a folder, invalid files are skipped with a warning. Gaps in damaged logs also give a
@@ -98,7 +98,7 @@ class _Messages:
         values = {
             name: _column([rows.get(k) for k in range(count)]) for name, rows in self._rows.items()
         }
-        # A value that is a mapping in some messages and None in others has the mapping's columns.
+        # A value that is a mapping in some messages, and None in others, has the mapping's columns.
         whole = {
             name
             for name, rows in self._rows.items()

@@ -1,6 +1,6 @@
-"""Replays flight decisions from a flight log: does the program decide the same again?
+"""Recomputes flight decisions from a flight log, and compares them with the logged ones.
 
-Each tick is repeated with its logged inputs and memory, so differences do not propagate.
+Each tick is computed from its logged inputs and memory, so differences do not propagate.
 """
 
 import math
@@ -42,9 +42,9 @@ class FlightDifference:
 
 
 class FlightReplay:
-    """Repeats the ticks of a log in order.
+    """Recomputes the ticks of a log in order.
 
-    `ticks` were repeated, of which `differing` differ; `passed_over` could not be, since messages
+    `ticks` were recomputed, of which `differing` differ; `passed_over` could not be, since messages
     before them are missing. `began_unix_s` is the time of the first.
     """
 
@@ -55,19 +55,19 @@ class FlightReplay:
         self.differences: list[FlightDifference] = []
         self._reader = reader or TickReader()
         # Differences of the last tick by item.
-        self._going_on: dict[str, FlightDifference] = {}
+        self._ongoing: dict[str, FlightDifference] = {}
 
     def run(self, unix_time_s: float, message: Mapping[str, Any]) -> None:
-        """Repeat one message of the topic `flight`. Raises TickError."""
+        """Recompute the tick of one message of the topic `flight`. Raises TickError."""
         tick = self._reader.tick(message)
         if tick is None:
             self.passed_over += 1
-            self._going_on = {}
+            self._ongoing = {}
             return
         if not self.ticks:
             self.began_unix_s = unix_time_s
         self.ticks += 1
-        before, self._going_on = self._going_on, {}
+        before, self._ongoing = self._ongoing, {}
         for each in differing(tick):
             difference = before.get(each.what)
             if difference is None or difference.differing.is_rounding != each.is_rounding:
@@ -75,8 +75,8 @@ class FlightReplay:
                 self.differences.append(difference)
             difference.until_unix_s = unix_time_s
             difference.ticks += 1
-            self._going_on[each.what] = difference
-        self.differing += bool(self._going_on)
+            self._ongoing[each.what] = difference
+        self.differing += bool(self._ongoing)
 
 
 def differing(tick: FlightTick) -> Iterator[Differing]:

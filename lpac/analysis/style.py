@@ -40,7 +40,7 @@ CURVES: tuple[tuple[str, Any], ...] = (
     (SKY, (0, (3, 1, 1, 1))),
     (VERMILLION, "-"),
 )
-# For more curves, in figures without a map: a policy and all baselines.
+# More curves, for figures without a map: a policy and all baselines.
 MANY_CURVES: tuple[tuple[str, Any], ...] = (
     *CURVES, (ORANGE, "-"), (GREY, "--"), (YELLOW, "-."), (FAINT, "-"),
 )  # fmt: skip
