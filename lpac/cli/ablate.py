@@ -69,11 +69,13 @@ def _progress() -> "Iterator[Callable[[AblationProgress], None]]":
 
 
 def _show(read: "Ablation", results: "list[VariantResult]", folder: Path) -> None:
+    from edge.core.counted import counted
     from lpac.ablate.summary import no_claim, numbers_of
 
     config = read.config
     typer.echo(
-        f"{config.worlds} worlds of the {config.world_set} set from {read.worlds.start} on, "
+        f"{counted(config.worlds, 'world')} of the {config.world_set} set from "
+        f"{read.worlds.start} on, "
         f"{config.set_up}, {config.duration_s:g} s; cost at the end over that at the start\n"
     )
     columns = ("", "mean", "over seeds", "to base", "95 %", "")
@@ -87,7 +89,7 @@ def _show(read: "Ablation", results: "list[VariantResult]", folder: Path) -> Non
         typer.echo(f"\n{claim}")
     if config.world_set == "test":
         typer.echo(
-            f"\n{config.worlds} worlds of the test set were used: if you select by these results, "
-            "it is no longer a test set"
+            f"\nthe test set was used, {counted(config.worlds, 'world')}: if you select by these "
+            "results, it is no longer a test set"
         )
     typer.echo(f"\nsee {folder}: README.md, ablation.json, differences.png, and each training")

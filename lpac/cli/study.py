@@ -83,8 +83,10 @@ def fly_study(task: StudyTask, ray: str | None, *, as_json: bool) -> None:
     [report] = fly_together([task], task.folder, ray)
     show_report(report, task.folder, as_json=as_json)
     if not as_json and (opened := report.data["test_set_opened"]) is not None:
+        from edge.core.counted import counted
+
         caveat = "if you select by these results, it is no longer a test set"
-        typer.echo(f"{opened['worlds']} worlds of the test set were used: {caveat}")
+        typer.echo(f"the test set was used, {counted(opened['worlds'], 'world')}: {caveat}")
 
 
 def fly_together(tasks: Sequence[StudyTask], folder: Path, ray: str | None) -> "list[Report]":

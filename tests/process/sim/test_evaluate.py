@@ -168,7 +168,7 @@ def test_whether_one_is_better(tmp_path: Path) -> None:
     )  # fmt: skip
     assert result.returncode == 0, (result.stdout, result.stderr)
     assert "clairvoyant-cvt is better than decentralized-cvt: cost at the end 0." in result.stdout
-    assert "6 worlds of the test set were used" in result.stdout
+    assert "the test set was used, 6 worlds" in result.stdout
     told = json.loads((tmp_path / "evaluation.json").read_text())
     assert told["test_set_opened"].keys() == {"date", "bundle_ids", "worlds"}
     assert told["conditions"][0]["compared"]["better"] == "a"
