@@ -140,8 +140,8 @@ class FlightLog:
         periods compress worse.
 
         No segment grows beyond `max_segment_bytes`. The oldest segments of this name, also of
-        earlier starts, are deleted to keep their total within `max_total_bytes` and to leave 20 MB
-        of the disk free, or a tenth of a smaller disk.
+        earlier starts, are deleted to keep their total within `max_total_bytes`. They also make
+        room on the disk: 20 MB stay free, or a tenth of a smaller disk.
 
         Raises ValueError for an impossible limit. `recording` is False while nothing can be
         written.

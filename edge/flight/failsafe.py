@@ -1,9 +1,9 @@
 """PX4's failsafe parameters, and their required values.
 
-Statements about PX4 hold for v1.14 and later. Its delay COM_FAIL_ACT_T, a hold before it acts,
-applies to a lost remote control or ground station, a critical battery, a failing motor or
-propeller, and to fence actions return and land. A lost offboard signal or position, and traffic,
-are acted on at once.
+Statements about PX4 hold for v1.14 and later. With its delay COM_FAIL_ACT_T, it holds before it
+acts on a lost remote control or ground station, a critical battery, a failing motor or propeller,
+and before the fence actions return and land. A lost offboard signal or position, and traffic, are
+acted on at once.
 
 No parameter controls the action on a lost position.
 """

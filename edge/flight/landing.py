@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from edge.core import F64
 from edge.core.fence import Fence
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.silence import SilenceLimits, deviation_m, possible_places_m
@@ -106,9 +105,9 @@ def place_to_land(
         if kept_m >= apart_m - min(_KEPT_M, _KEPT_SHARE * apart_m):
             return before_m
     corners = np.array(fence.vertices_m)
-    grid = np.stack(
-        np.meshgrid(*(np.arange(low, high, _GRID_M) for low, high in _ranges(corners))), axis=-1
-    ).reshape(-1, 2)
+    ranges = zip(corners.min(axis=0).tolist(), corners.max(axis=0).tolist(), strict=True)
+    axes = (np.arange(low, high, _GRID_M) for low, high in ranges)
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     edges = fence.edges()
     places_m = grid[(grid @ edges.inward.T - edges.offsets_m).min(axis=1) >= fence.buffer_m]
     if not len(places_m):
@@ -118,8 +117,3 @@ def place_to_land(
     best = np.lexsort((away_m, -np.minimum(clear_m, apart_m)))[0]
     x_m, y_m = places_m[best].tolist()
     return x_m, y_m
-
-
-def _ranges(corners: F64) -> list[tuple[float, float]]:
-    lows, highs = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-    return list(zip(lows, highs, strict=True))

@@ -1,7 +1,7 @@
 """Margins from errors: between robots, to the ground, inside and around the fence.
 
 Each margin is a sum of errors that a vehicle may have at once, each at its worst and in the worst
-direction, so that it holds in truth whatever the estimates are. docs/faults.md shows the sums.
+direction. So it holds in truth, whatever the estimates are. docs/faults.md shows the sums.
 """
 
 import functools
@@ -155,7 +155,7 @@ class ErrorBudget(Bounded):
     def free_ground(self, limits: MotionLimits, px4_fence_m: float, ceiling_m: float) -> Margin:
         """Width of the ground around the fence's line that must be free of people, in whole m.
 
-        The vehicle is beyond the line by its position error, flies to PX4's fence `px4_fence_m`
+        The vehicle is beyond the line by its position error. It flies to PX4's fence `px4_fence_m`
         further out, needs its way to stop, and loses its motors there, at the ceiling plus its
         height error. It falls against the air's drag, and drifts with the greater of its maximum
         speed and the wind's.

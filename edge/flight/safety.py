@@ -212,15 +212,17 @@ def brake(
 ) -> F64:
     """Limit `wanted_m_s` so that the robot keeps its distance from others.
 
-    `velocity_m_s` is the robot's own estimate. Neighbours are extrapolated at constant velocity. A
-    neighbour at least `level_m` above or below has no effect, since robots cross in their height
-    slots, unless it climbs or descends through this height before the robot could leave its way, or
-    a pilot flies it at about this height. The robot may close half the slack to another one, which
-    does the same, and all of it to a piloted one. It may always fly away; from a robot that is too
-    near it must, by half of the missing distance, or estimation errors would only ever reduce
-    distances. A passing robot does not give way, so the robot leaves all of its way, measured from
-    the place where the vehicle comes to rest, so that it does not turn back beneath. Climbing is
-    not limited. Giving way leads over no edge of `fence`; None for no fence.
+    `velocity_m_s` is the robot's own estimate. Neighbours are extrapolated at constant velocity.
+    Robots cross in their height slots, so a neighbour at least `level_m` above or below has no
+    effect, with two exceptions: one that climbs or descends through this height before the robot
+    could leave its way, and one that a pilot flies at about this height.
+
+    The robot may close half the slack to another one, which does the same, and all of it to a
+    piloted one. It may always fly away. From a robot that is too near it must, by half of the
+    missing distance: otherwise estimation errors would only ever reduce distances. A passing robot
+    does not give way, so the robot leaves all of its way. Its distance is measured from the place
+    where the vehicle comes to rest, so that the robot does not turn back beneath. Climbing is not
+    limited. Giving way leads over no edge of `fence`; None for no fence.
 
     `silent` robots fell silent in flight, and may fly on, hover or come down. A robot below or
     level with one leaves its possible places as for a passing robot: the way from its last place to
@@ -250,8 +252,8 @@ def make_room(
     """Limit `wanted_m_s` of a robot that holds its place: like `brake`, with fewer neighbours.
 
     Neighbours with unknown values are ignored, as are silent ones, which may not hear this robot
-    and expect it to stay. If the robot may soon land here, as its neighbours may (`lands`), it
-    parts from each of them at any height by `landed_m` horizontally, of which each flies half.
+    and expect it to stay. With `lands`, the robot may soon land here, as its neighbours may. It
+    then parts from each of them, at any height, by `landed_m` horizontally. Each flies half.
     """
     known = [each for each in neighbours if _is_known(each)]
     if not lands:

@@ -137,7 +137,7 @@ def run(config: RobotConfig, stop: Stop) -> None:
             update_identity = partial(identity.update, signed)
         program = _Program(config, node, vehicle, watchdog, recorder, link, update_identity)
         gc.collect()
-        gc.freeze()  # Spares collections in flight the objects loaded so far.
+        gc.freeze()  # Spares collections in flight the objects loaded by now.
         libc.malloc_trim(0)  # Returns the memory of the verification to the system.
         program.start()
         parts.callback(program.leave)
