@@ -59,8 +59,10 @@ def test_the_page_runs(page: Path) -> None:
 def test_no_example_is_left_out() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} == set(SCRIPTS)
     assert {path.name for path in EXAMPLES.glob("*.ipynb")} == set(NOTEBOOKS)
+    assert "(../examples/README.md)" in PAGE
+    listed = (EXAMPLES / "README.md").read_text()
     for name in (*SCRIPTS, *NOTEBOOKS):
-        assert f"examples/{name}" in PAGE
+        assert f"]({name})" in listed
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
