@@ -229,6 +229,11 @@ def read_state_dict(path: Path) -> dict[str, torch.Tensor]:
     return _tensors(path, _read_bytes(path))
 
 
+def parse_state_dict(content: bytes, name: str) -> dict[str, torch.Tensor]:
+    """Like `read_state_dict` for a file's content; `name` stands for the file in errors."""
+    return _tensors(Path(name), content)
+
+
 def _tensors(path: Path, content: bytes) -> dict[str, torch.Tensor]:
     state = _load(content, path)
     if isinstance(state, dict):

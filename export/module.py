@@ -6,7 +6,7 @@ import importlib.util
 import logging
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from importlib.metadata import version
@@ -68,15 +68,7 @@ def load_module(reference: str, checkpoint: Path | None) -> nn.Module:
 
     Raises ModuleError, one line, or CheckpointError.
     """
-    where, _, name = reference.rpartition(":")
-    try:
-        module = getattr(_import(where), name)()
-    except ModuleNotFoundError as error:
-        raise ModuleError(f"{reference}: {error}: run it where Python can import it") from None
-    except Exception as error:  # somebody else's code
-        raise ModuleError(f"{reference}: {type(error).__name__}: {error}") from None
-    if not isinstance(module, nn.Module):
-        raise ModuleError(f"{reference}: is a {type(module).__name__}: must be a torch.nn.Module")
+    module = load_class(reference)()
     if checkpoint is not None:
         try:
             module.load_state_dict(read_state_dict(checkpoint))
@@ -86,6 +78,22 @@ def load_module(reference: str, checkpoint: Path | None) -> nn.Module:
     elif any(True for _ in module.parameters()):
         raise ModuleError(f"{reference}: has weights: give --checkpoint")
     return module
+
+
+def load_class(reference: str) -> Callable[[], nn.Module]:
+    """Constructor of "package.module:Class" or "file.py:Class". Raises ModuleError, one line."""
+    where, _, name = reference.rpartition(":")
+    try:
+        made = getattr(_import(where), name)
+        module = made()
+    except ModuleNotFoundError as error:
+        raise ModuleError(f"{reference}: {error}: run it where Python can import it") from None
+    except Exception as error:  # somebody else's code
+        raise ModuleError(f"{reference}: {type(error).__name__}: {error}") from None
+    if not isinstance(module, nn.Module):
+        raise ModuleError(f"{reference}: is a {type(module).__name__}: must be a torch.nn.Module")
+    constructor: Callable[[], nn.Module] = made
+    return constructor
 
 
 def _import(where: str) -> Any:

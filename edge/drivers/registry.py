@@ -48,6 +48,8 @@ _BUILT_IN = {
         EntryPoint("px4", "edge.drivers.px4.driver:px4_vehicle", _VEHICLES),
         EntryPoint("zenoh", "edge.drivers.link:zenoh_link", _LINKS),
         EntryPoint("lpac", "lpac.train.lpac:lpac_network", _LEARNABLE),
+        EntryPoint("network", "lpac.train.network:module_network", _LEARNABLE),
+        EntryPoint("attention", "lpac.train.attention:attention_network", _LEARNABLE),
     )
 }
 

@@ -32,6 +32,13 @@ MAP_CHANNELS: dict[int, tuple[str, ...]] = {
 }
 
 
+def require_channels(channels: tuple[str, ...]) -> None:
+    """Raise ValueError unless `channels` are of `MAP_CHANNELS`."""
+    if channels not in MAP_CHANNELS.values():
+        allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
+        raise ValueError(f"channels = {', '.join(channels)}: allowed are {allowed}")
+
+
 class Resize:
     """Bilinear, antialiased resize from `size` to `new_size` cells: A @ x @ A.T for an image x.
 

@@ -164,14 +164,19 @@ class Fit:
         received = rng.random(batch.adjacency.shape, np.float32) >= self._config.lost_messages
         shift = self._to_device(shift_operator(batch.adjacency, received))
         module.train(len(velocities) > 1)
+        swarms = (
+            {name: self._to_device(values) for name, values in inputs.items()},
+            shift,
+            torch.from_numpy(batch.present).to(self._device),
+        )
+        expert, deviation = self._to_device(velocities), self._deviation.to(self._device)
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
-            predicted = module(
-                {name: self._to_device(values) for name, values in inputs.items()},
-                shift,
-                torch.from_numpy(batch.present).to(self._device),
+            own_loss = getattr(module, "loss", None)
+            loss = (
+                own_loss(*swarms, expert)
+                if own_loss
+                else ((module(*swarms) - expert) / deviation).square().mean()
             )
-        error = (predicted - self._to_device(velocities)) / self._deviation.to(self._device)
-        loss = error.square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(module.parameters(), _MAX_GRADIENT_NORM)

@@ -8,7 +8,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, cast
+from typing import Annotated, Protocol, cast
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch.nn import functional
 from edge.core import F32
 from edge.core.schema import AtLeastOne, AtLeastZero, Bounded, from_mapping
 from edge.policy.bundle import Bundle
-from edge.policy.images import MAP_CHANNELS, NEIGHBOURS
+from edge.policy.images import MAP_CHANNELS, require_channels
 from export.checkpoint import (
     ACTION_SIZE,
     BATCH_NORM_EPS,
@@ -31,11 +31,38 @@ from export.checkpoint import (
 from export.exporter import bundle_of
 from export.parameters import PolicyParameters
 from lpac.train.family import Inputs, StateDict
+from lpac.train.symmetry import turned_images, turned_vectors
 from lpac.train.task import CoverageTask
 
 _FIRST_CONVOLUTION = "cnn_backbone.conv0.weight"
 # A counter without effect, missing in some checkpoints.
 _BATCHES = "num_batches_tracked"
+
+
+class CnnSizes(Protocol):
+    """Keys of [network] for the CNN: see `LpacNetwork`."""
+
+    @property
+    def channels(self) -> tuple[str, ...]: ...
+    @property
+    def image_size(self) -> int: ...
+    @property
+    def cnn_channels(self) -> tuple[int, ...]: ...
+    @property
+    def kernel(self) -> int: ...
+    @property
+    def features(self) -> int: ...
+
+
+def last_side(sizes: CnnSizes) -> int:
+    """Side of the last convolution's output. Raises ValueError if there is none."""
+    border = len(sizes.cnn_channels) * (sizes.kernel - 1)
+    if sizes.image_size <= border:
+        raise ValueError(
+            f"image_size = {sizes.image_size}: must be above {border}, the border that the "
+            "convolutions remove"
+        )
+    return sizes.image_size - border
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,19 +89,8 @@ class LpacNetwork(Bounded):
     mlp_layers: Annotated[int, Meta(ge=2)] = 2
 
     def check_rules(self) -> None:
-        if self.channels not in MAP_CHANNELS.values():
-            allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
-            raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
-        if self._side < 1:
-            raise ValueError(
-                f"image_size = {self.image_size}: must be above {self.image_size - self._side}, "
-                "the border that the convolutions remove"
-            )
-
-    @property
-    def _side(self) -> int:
-        """Side of the last convolution's output."""
-        return self.image_size - len(self.cnn_channels) * (self.kernel - 1)
+        require_channels(self.channels)
+        last_side(self)
 
     @property
     def task(self) -> CoverageTask:
@@ -83,7 +99,7 @@ class LpacNetwork(Bounded):
 
     def module(self, actions_mean: F32, actions_std: F32) -> "LpacModule":
         """See `Learnable`."""
-        return LpacModule(self, self._side, actions_mean, actions_std)
+        return LpacModule(self, actions_mean, actions_std)
 
     def initial(self, checkpoint: bytes, name: str) -> StateDict:
         """See `Learnable`; images unknown to the checkpoint's CNN get weights of 0."""
@@ -113,31 +129,11 @@ class LpacNetwork(Bounded):
 
     def symmetric(self, inputs: Inputs, velocities: F32, turned: int) -> tuple[Inputs, F32]:
         """See `Learnable`; bit 0 mirrors x, bit 1 mirrors y, bit 2 swaps the two."""
-        images, position = inputs["images"], inputs["position_feature"]
-        # Channels that change sign or order in a mirrored world.
-        plane = {name: self.channels.index(name) for name in NEIGHBOURS if name in self.channels}
-        for axis in range(2):
-            if turned & 1 << axis:
-                images = np.flip(images, 2 + axis).copy()
-                # Features are symmetric about 1.
-                position, velocities = position.copy(), velocities.copy()
-                position[:, axis] = 2.0 - position[:, axis]
-                velocities[:, axis] *= -1.0
-                if plane:
-                    images[:, plane[NEIGHBOURS[axis]]] *= -1.0
-        if turned & 4:
-            images = images.swapaxes(2, 3)
-            order = list(range(len(self.channels)))
-            if plane:
-                x, y = (plane[name] for name in NEIGHBOURS)
-                order[x], order[y] = y, x
-            images = images[:, order]
-            position, velocities = position[:, ::-1], velocities[:, ::-1]
-        turned_inputs = {
-            "images": np.ascontiguousarray(images),
-            "position_feature": np.ascontiguousarray(position),
-        }
-        return turned_inputs, np.ascontiguousarray(velocities)
+        return {
+            "images": turned_images(inputs["images"], self.channels, turned),
+            # Features are symmetric about 1.
+            "position_feature": turned_vectors(inputs["position_feature"] - 1.0, turned) + 1.0,
+        }, turned_vectors(velocities, turned)
 
     def checkpoint(self, state: StateDict) -> bytes:
         """See `Learnable`; a file for `torch.load`."""
@@ -170,13 +166,11 @@ class LpacModule(nn.Module):
     actions_mean: Tensor
     actions_std: Tensor
 
-    def __init__(
-        self, network: LpacNetwork, side: int, actions_mean: F32, actions_std: F32
-    ) -> None:
+    def __init__(self, network: LpacNetwork, actions_mean: F32, actions_std: F32) -> None:
         super().__init__()
         self.register_buffer("actions_mean", torch.from_numpy(actions_mean.copy()))
         self.register_buffer("actions_std", torch.from_numpy(actions_std.copy()))
-        self.cnn_backbone = _Cnn(network, side)
+        self.cnn_backbone = Cnn(network)
         self.gnn_backbone = _Gnn(network)
         self.gnn_mlp = _Mlp(network)
         self.output_linear = nn.Linear(network.mlp_width, ACTION_SIZE)
@@ -193,8 +187,10 @@ class LpacModule(nn.Module):
         return actions * self.actions_std + self.actions_mean
 
 
-class _Cnn(nn.Module):
-    def __init__(self, network: LpacNetwork, side: int) -> None:
+class Cnn(nn.Module):
+    """The paper's CNN: features (R, features) of images (R, channels, size, size)."""
+
+    def __init__(self, network: CnnSizes) -> None:
         super().__init__()
         self._convolutions = len(network.cnn_channels)
         inputs = len(network.channels)
@@ -202,7 +198,7 @@ class _Cnn(nn.Module):
             self.add_module(f"conv{i}", nn.Conv2d(inputs, outputs, network.kernel))
             self.add_module(f"batch_norm{i}", nn.BatchNorm2d(outputs, eps=BATCH_NORM_EPS))
             inputs = outputs
-        self.linear_1 = nn.Linear(inputs * side**2, network.features)
+        self.linear_1 = nn.Linear(inputs * last_side(network) ** 2, network.features)
 
     def forward(self, images: Tensor) -> Tensor:
         # A fifth faster on a CPU.

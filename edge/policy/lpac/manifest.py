@@ -7,7 +7,7 @@ from edge.core.aggregation import Geometry
 from edge.core.schema import AtLeastOne, Bounded, ConfigError, from_mapping
 from edge.policy.bundle import LPAC, BundleError, Manifest
 from edge.policy.golden import GOLDEN
-from edge.policy.images import EXPLORED, MAP_CHANNELS
+from edge.policy.images import EXPLORED, require_channels
 
 CNN = "cnn.onnx"
 ACTION = "action.onnx"
@@ -29,9 +29,7 @@ class Images(Bounded):
     padding: Literal["none"] = "none"
 
     def check_rules(self) -> None:
-        if self.channels not in MAP_CHANNELS.values():
-            allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
-            raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
+        require_channels(self.channels)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from edge.core.schema import AtLeastOne, Bounded, ConfigError, Positive, from_ma
 from edge.policy.bundle import BundleError, Manifest
 from edge.policy.golden import GOLDEN
 from edge.policy.graph import Shape
-from edge.policy.images import EXPLORED, MAP_CHANNELS
+from edge.policy.images import EXPLORED, require_channels
 
 NETWORK = "network"
 ENCODE, STEP = "encode.onnx", "step.onnx"
@@ -42,9 +42,7 @@ class Maps(Bounded):
     size: AtLeastOne
 
     def check_rules(self) -> None:
-        if self.channels not in MAP_CHANNELS.values():
-            allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
-            raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
+        require_channels(self.channels)
 
 
 @dataclass(frozen=True, slots=True)
