@@ -15,16 +15,28 @@ from bench import BUNDLE, CHECKPOINT, cnn
 from bench.moment import NEIGHBOURS, Moment, moment_in_flight, neighbourhood
 from bench.result import Result, Table, Target, progress
 from bench.timing import interleaved, quartiles, with_quartiles
-from bench.torch_robot import Network, PygLayer, TapLayer, TorchRobot, exchange_inputs, load_network
+from bench.torch_robot import (
+    Network,
+    NetworkForm,
+    PygLayer,
+    TapLayer,
+    TorchRobot,
+    exchange_inputs,
+    load_network,
+)
 from edge.core import F32
 from edge.core.aggregation import HopBuffer
+from edge.drivers.registry import load_policy
 from edge.policy.bundle import load_bundle
-from edge.policy.family import Observation
+from edge.policy.family import Observation, Policy
 from edge.policy.images import PolicyImages
 from edge.policy.lpac.manifest import gnn_graph
 from edge.policy.lpac.policy import LpacPolicy
+from export.module import network_bundle
+from export.parameters import PolicyParameters
 
-EDGE, TRACED, EAGER = "lpac-edge", "torch traced", "torch + PyG eager"
+EDGE, FORM = "lpac-edge", "family network"
+TRACED, EAGER = "torch traced", "torch + PyG eager"
 TOLERANCE = 1e-4
 
 Outputs = tuple[F32, F32]
@@ -42,7 +54,11 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
     eager = load_network(CHECKPOINT, PygLayer)
     taps = load_network(CHECKPOINT, TapLayer)
 
-    ticks = {EDGE: robot.tick, **_torch_ticks(eager, taps, moment, policy)}
+    ticks = {
+        EDGE: robot.tick,
+        FORM: AgentRobot(_network_form(taps, policy), moment).tick,
+        **_torch_ticks(eager, taps, moment, policy),
+    }
     exchanges = {EDGE: robot.exchange, EAGER: _torch_exchange(eager, moment, robot.features)}
     figures: dict[str, Any] = {"neighbours": NEIGHBOURS, "rounds": rounds}
     tables = []
@@ -64,6 +80,12 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
         figures,
         tables,
         [
+            Target(
+                "tick: family network's time over family lpac's",
+                figures["tick"]["slower_than_edge"][FORM]["median"],
+                1.1,
+                at_least=False,
+            ),
             _faster("tick", TRACED, figures, 1.7),
             _faster("tick", EAGER, figures, 5.0),
             _faster("gnn", EAGER, figures, 10.0),
@@ -83,17 +105,11 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Result:
     )
 
 
-class EdgeRobot:
+class AgentRobot:
     """lpac-edge's tick at a moment of a flight."""
 
-    def __init__(self, policy: LpacPolicy, moment: Moment) -> None:
-        assert policy.manifest.perception
-        self._policy = policy
+    def __init__(self, policy: Policy, moment: Moment) -> None:
         self._moment = moment
-        self._hops = HopBuffer(policy.geometry)
-        images = policy.lpac.images
-        assert images
-        self._images = PolicyImages(policy.manifest.perception, images.channels, images.size)
         self._agent = policy.agent()
         self._neighbours = neighbourhood(moment.position, moment.neighbours, moment.payloads)
         self.features = self._agent.observe(self._observation()).features
@@ -102,6 +118,28 @@ class EdgeRobot:
         """Velocity (2,) and message (message_size,)."""
         features = self._agent.observe(self._observation()).features
         return self._agent.step(features, self._neighbours)[:2]
+
+    def _observation(self) -> Observation:
+        moment = self._moment
+        return Observation(
+            moment.position,
+            moment.memory.local_map(moment.position),
+            moment.neighbours,
+            np.zeros(2),
+        )
+
+
+class EdgeRobot(AgentRobot):
+    """The tick of a robot of the paper's family, and its parts."""
+
+    def __init__(self, policy: LpacPolicy, moment: Moment) -> None:
+        assert policy.manifest.perception
+        super().__init__(policy, moment)
+        self._policy = policy
+        self._hops = HopBuffer(policy.geometry)
+        images = policy.lpac.images
+        assert images
+        self._images = PolicyImages(policy.manifest.perception, images.channels, images.size)
 
     def exchange(self) -> Outputs:
         """The graph neural network alone: x_L (F_L,) and message (message_size,)."""
@@ -116,14 +154,14 @@ class EdgeRobot:
         """Input of the CNN, (1, channels, size, size)."""
         return self._images.images(*self._observation()[:3]).copy()
 
-    def _observation(self) -> Observation:
-        moment = self._moment
-        return Observation(
-            moment.position,
-            moment.memory.local_map(moment.position),
-            moment.neighbours,
-            np.zeros(2),
-        )
+
+def _network_form(network: Network, policy: LpacPolicy) -> Policy:
+    """The same network as a bundle of the family `network`."""
+    manifest, images = policy.manifest, policy.lpac.images
+    assert manifest.perception and images
+    trained = PolicyParameters(manifest.perception, manifest.training)
+    form = NetworkForm(network, images.channels, images.size)
+    return load_policy(network_bundle(form, trained, FORM, {}))
 
 
 def _torch_ticks(

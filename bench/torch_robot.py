@@ -113,8 +113,13 @@ class Network(nn.Module):
         images = torch.cat([resized[:, :1], neighbours[None], resized[:, 1:]], 1)
         features = torch.cat([self.cnn_backbone(images), position[None]], 1)
         features, message = self.exchange(features, payloads, scale)
+        return self.velocity(features), message
+
+    def velocity(self, features: Tensor) -> Tensor:
+        """Velocity (2,) of x_L (1, F_L)."""
         actions = self.output_linear(self.gnn_mlp(features))
-        return (actions * self.actions_std + self.actions_mean)[0], message
+        velocity: Tensor = (actions * self.actions_std + self.actions_mean)[0]
+        return velocity
 
     def exchange(self, features: Tensor, payloads: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
         """The graph neural network: x_L (1, F_L) from x_0 (1, F_0), and the own payload."""
@@ -127,6 +132,26 @@ class Network(nn.Module):
             features, hops = layer(features, held.reshape(-1, *shape), scale)
             own.append(hops.flatten())
         return features, torch.cat(own) * scale
+
+
+class NetworkForm(nn.Module):
+    """The network with the contract of the family `network`."""
+
+    def __init__(self, network: Network, channels: tuple[str, ...], image_size: int) -> None:
+        super().__init__()
+        self.channels, self.image_size = channels, image_size
+        self.message_size = sum(hops * inputs for hops, inputs in network.held_shapes)
+        self.network = network
+
+    def encode(self, maps: Tensor, position: Tensor) -> Tensor:
+        """x_0 (F_0,)."""
+        return torch.cat([self.network.cnn_backbone(maps[None])[0], position + 0.5])
+
+    def step(self, features: Tensor, messages: Tensor, degree: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity (2,) and the own payload."""
+        scale = (degree > 0.0).to(degree.dtype) * degree.clamp(min=1.0).rsqrt()
+        last, message = self.network.exchange(features[None], messages, scale)
+        return self.network.velocity(last), message
 
 
 class TorchRobot:

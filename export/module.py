@@ -103,6 +103,7 @@ def _import(where: str) -> Any:
     path = Path(where)
     if not path.is_file():
         raise ModuleNotFoundError(f"{where} is not a file")
+    sys.path.insert(0, str(path.parent))  # as for a script
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -170,7 +170,12 @@ class Fit:
             torch.from_numpy(batch.present).to(self._device),
         )
         expert, deviation = self._to_device(velocities), self._deviation.to(self._device)
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16):
+        with (
+            torch.random.fork_rng(devices=[]),
+            torch.autocast(self._device.type, torch.bfloat16, enabled=self._bf16),
+        ):
+            # What the module draws, such as dropout.
+            torch.manual_seed(int(rng.integers(2**63)))
             own_loss = getattr(module, "loss", None)
             loss = (
                 own_loss(*swarms, expert)

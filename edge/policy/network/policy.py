@@ -51,7 +51,11 @@ class NetworkPolicy:
             )
             if problem := array_problem(name, inputs[name], shape):
                 raise ValueError(problem)
-        [features] = self._encode.run({name: inputs[name] for name in self.network.encode})
+        return self.encode({name: inputs[name] for name in self.network.encode})
+
+    def encode(self, inputs: Mapping[str, F32]) -> F32:
+        """Features of the inputs that the manifest names."""
+        [features] = self._encode.run(inputs)
         return features
 
     def logged_step(
@@ -63,9 +67,9 @@ class NetworkPolicy:
     def step(self, features: F32, neighbours: Neighbourhood, memory: F32) -> tuple[PolicyStep, F32]:
         """The step, and the new memory (memory_size,)."""
         shape = (len(neighbours.payloads), self.message_size)
-        messages = np.empty(shape, np.float32)
-        for row, payload in zip(messages, neighbours.payloads, strict=True):
-            row[:] = payload
+        messages = np.zeros(shape, np.float32)
+        if messages.size:
+            messages = np.concatenate(neighbours.payloads, dtype=np.float32).reshape(shape)
         inputs = {
             "features": features,
             "messages": messages,
@@ -107,7 +111,7 @@ class NetworkAgent:
                 inputs[name] = velocity.astype(np.float32)
             else:
                 inputs[name] = (neighbours - position).astype(np.float32)
-        return Perceived(self._policy.logged_features(inputs), inputs)
+        return Perceived(self._policy.encode(inputs), inputs)
 
     def step(self, features: F32, neighbours: Neighbourhood) -> PolicyStep:
         """The next step. Raises ValueError, and keeps its memory, if the new one is not finite."""
