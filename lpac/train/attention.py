@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from edge.core.schema import AtLeastOne, Bounded, Positive, from_mapping
 from edge.policy.images import MAP_CHANNELS, require_channels
-from lpac.train.lpac import Cnn, last_side
+from lpac.train.lpac import ImageNetwork, last_side
 from lpac.train.network import ModuleNetwork
 
 _POSITION = 2
@@ -72,7 +72,7 @@ class AttentionModule(nn.Module):
         self.channels, self.image_size = sizes.channels, sizes.image_size
         self.message_size = sizes.layers * sizes.width
         self._sizes = sizes
-        self.cnn = Cnn(sizes)
+        self.cnn = ImageNetwork(sizes)
         inputs = [sizes.features + _POSITION, *[sizes.width] * (sizes.layers - 1)]
         self._layers = [_AttentionLayer(size, sizes) for size in inputs]
         self.layers = nn.ModuleList(self._layers)

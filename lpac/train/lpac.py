@@ -39,7 +39,7 @@ _FIRST_CONVOLUTION = "cnn_backbone.conv0.weight"
 _BATCHES = "num_batches_tracked"
 
 
-class CnnSizes(Protocol):
+class ImageNetworkSizes(Protocol):
     """Keys of [network] for the CNN: see `LpacNetwork`."""
 
     @property
@@ -54,7 +54,7 @@ class CnnSizes(Protocol):
     def features(self) -> int: ...
 
 
-def last_side(sizes: CnnSizes) -> int:
+def last_side(sizes: ImageNetworkSizes) -> int:
     """Side of the last convolution's output. Raises ValueError if there is none."""
     border = len(sizes.cnn_channels) * (sizes.kernel - 1)
     if sizes.image_size <= border:
@@ -170,7 +170,7 @@ class LpacModule(nn.Module):
         super().__init__()
         self.register_buffer("actions_mean", torch.from_numpy(actions_mean.copy()))
         self.register_buffer("actions_std", torch.from_numpy(actions_std.copy()))
-        self.cnn_backbone = Cnn(network)
+        self.cnn_backbone = ImageNetwork(network)
         self.gnn_backbone = _Gnn(network)
         self.gnn_mlp = _Mlp(network)
         self.output_linear = nn.Linear(network.mlp_width, ACTION_SIZE)
@@ -187,10 +187,10 @@ class LpacModule(nn.Module):
         return actions * self.actions_std + self.actions_mean
 
 
-class Cnn(nn.Module):
+class ImageNetwork(nn.Module):
     """The paper's CNN: features (R, features) of images (R, channels, size, size)."""
 
-    def __init__(self, network: CnnSizes) -> None:
+    def __init__(self, network: ImageNetworkSizes) -> None:
         super().__init__()
         self._convolutions = len(network.cnn_channels)
         inputs = len(network.channels)
