@@ -31,9 +31,9 @@ def check_frame(result: dict[str, Any], name: str, targets: int) -> None:
 @pytest.mark.slow
 def test_policy(tmp_path: Path) -> None:
     result = kept(policy.measure(rounds=2, round_s=0.001), tmp_path)
-    check_frame(result, "policy", targets=4)
+    check_frame(result, "policy", targets=5)
     both = {policy.EDGE, policy.EAGER}
-    for name, variants in (("tick", {*both, policy.TRACED}), ("gnn", both)):
+    for name, variants in (("tick", {*both, policy.TRACED, policy.FORM}), ("gnn", both)):
         figures = result["figures"][name]
         assert figures["largest_difference"] <= policy.TOLERANCE
         assert set(figures["slower_than_edge"]) == variants
