@@ -56,7 +56,7 @@ class AggregatedMessage:
 class HopBuffer:
     """Robots' y_kl for k = 0..K and l = 1..L, updated in place once per policy tick.
 
-    Each robot has its own. Not thread-safe: it belongs to the policy thread.
+    `robots` exceeds 1 only in batched simulation. Not thread-safe: it belongs to the policy thread.
     """
 
     def __init__(self, geometry: Geometry, robots: int = 1) -> None:
@@ -68,7 +68,7 @@ class HopBuffer:
         )
         self._sum = np.zeros(geometry.message_size, np.float32)
         ends = np.cumsum([geometry.hops * size for size in inputs])
-        # Slice of each layer in the sum. A deep copy would separate views from the sum.
+        # Each layer's slice of the sum. Not views: a deep copy would separate them from the sum.
         self._parts = tuple(
             slice(end - geometry.hops * size, end)
             for end, size in zip(ends.tolist(), inputs, strict=True)
@@ -78,8 +78,8 @@ class HopBuffer:
         """y_kl = sum over neighbours j of S_ij (y_j)_{k-1,l}, for k = 1..K and all layers at once.
 
         `payloads` are the neighbours' messages, (message_size,) each. `degree` is d_i, larger than
-        their number if some messages were not received. S_ij = 1/sqrt(d_i d_j), where the sender
-        has applied its own factor.
+        their number if some messages were not received. S_ij = 1/sqrt(d_i d_j); the sender has
+        applied 1/sqrt(d_j).
         """
         if payloads:
             received = np.concatenate(payloads, dtype=np.float32).reshape(len(payloads), -1)

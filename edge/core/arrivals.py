@@ -1,6 +1,6 @@
-"""Monotonic counts of the messages received from another robot, by age.
+"""Cumulative counts of the messages received from another robot, by age.
 
-The difference of two counts is the reception in between.
+The difference between two counts covers the time in between.
 """
 
 from bisect import bisect_left, bisect_right
@@ -17,8 +17,8 @@ _BINS = len(AGE_EDGES_S) + 1
 class Arrivals(NamedTuple):
     """Messages of one robot received by another.
 
-    `sent` is the number of messages sent, by their sequence, from the first to the newest received
-    one. `undated` counts messages of unknown age, `by_age` (9,) those with ages in the bins of
+    `sent` counts the messages sent from the first to the newest received one, by sequence number.
+    `undated` counts messages of unknown age, `by_age` (9,) those with ages in the bins of
     `AGE_EDGES_S`.
     """
 
@@ -53,7 +53,7 @@ class Arrivals(NamedTuple):
         )
 
     def plus(self, sent: int, age_s: float | None) -> "Arrivals":
-        """Add a received message with this age, and `sent` sent ones."""
+        """Add one received message of this age (None: unknown), and `sent` sent ones."""
         if age_s is None:
             return self._replace(sent=self.sent + sent, undated=self.undated + 1)
         at, by_age = bisect_right(AGE_EDGES_S, age_s), list(self.by_age)
@@ -61,7 +61,7 @@ class Arrivals(NamedTuple):
         return Arrivals(self.sent + sent, self.undated, tuple(by_age))
 
     def older_than(self, edge_s: float) -> int:
-        """Number of messages of at least this age, one of `AGE_EDGES_S`."""
+        """Number of messages of at least the age `edge_s`, one of `AGE_EDGES_S`."""
         return sum(self.by_age[AGE_EDGES_S.index(edge_s) + 1 :])
 
     def age_s(self, share: float) -> float | None:

@@ -1,4 +1,4 @@
-"""Texts for errors of files."""
+"""Plain texts for file errors."""
 
 import errno
 
@@ -6,17 +6,17 @@ _WORDS = {
     errno.ENOENT: "there is no such file or folder",
     errno.EISDIR: "is a folder; a file is needed",
     errno.ENOTDIR: "a part of this path is a file; a folder is needed",
-    errno.EEXIST: "is there already, and is no folder",
+    errno.EEXIST: "already exists and is not a folder",
     errno.EACCES: "this user may not read or write it",
     errno.EPERM: "this user may not read or write it",
-    errno.EROFS: "is on a disk that is read-only",
+    errno.EROFS: "is on a read-only disk",
     errno.ENOSPC: "the disk is full",
-    errno.ENAMETOOLONG: "is too long a name",
+    errno.ENAMETOOLONG: "the name is too long",
 }
 
 
 def in_words(error: OSError) -> str:
-    """Text of an error without the file's name, by default the system's."""
+    """Text of an error, without the file's name; the system's text if there is none here."""
     return _WORDS.get(error.errno or 0) or error.strerror or str(error)
 
 

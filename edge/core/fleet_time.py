@@ -1,8 +1,8 @@
 """The fleet's time: the ground's clock as estimated by each robot.
 
-No wall clock is used. The ground echoes the robot's own time of its last received message. The time
-since then is a round trip, so the ground's clock is known to half a round trip, whatever the
-delays.
+No wall clock is used. The ground's states echo the time at which the robot sent the last message
+that the ground received. The time since then is a round trip, plus the time that the ground held
+the message. The ground's clock is thus known to half a round trip, whatever the delays.
 """
 
 import math
@@ -13,7 +13,7 @@ from msgspec import Struct
 _DRIFT = 1e-4
 # Resolution of echoed times.
 _ROUNDED_S = 1e-3
-# Grounds kept at the same time: robots change from one to another within about a second.
+# Grounds whose clocks are kept: a fleet changes its ground within about a second.
 _MOST_GROUNDS = 4
 
 
@@ -33,7 +33,7 @@ class Age(Struct, frozen=True):
 
 
 class _Known(Struct, frozen=True):
-    """The ground's clock minus the own one, at `at_s` of the own one."""
+    """A ground's clock minus the robot's, measured at `at_s` of the robot's clock."""
 
     offset_s: float
     uncertainty_s: float
@@ -44,7 +44,7 @@ class _Known(Struct, frozen=True):
 
 
 class FleetClock:
-    """The grounds' clocks relative to one robot's monotonic clock, whose time is `now_s`.
+    """Grounds' clocks relative to one robot's monotonic clock, whose time is `now_s`.
 
     One thread calls `update`; the other methods are thread-safe.
     """
@@ -72,7 +72,7 @@ class FleetClock:
         self._known = dict([*others[1 - _MOST_GROUNDS :], (base, new)])
 
     def at(self, now_s: float) -> FleetTime | None:
-        """The instant by the newest ground's clock; None if no ground has answered yet."""
+        """`now_s` by the newest ground's clock; None if no ground has answered yet."""
         known = self._known
         if not known:
             return None

@@ -30,9 +30,9 @@ class RobotMap:
         self._tiles: dict[tuple[int, int], F32] = {}
 
     def insert(self, view: F32, corner: tuple[int, int], seen: Bools | None = None) -> None:
-        """Write the square `view` with the lowest cell `corner`, clipped to the world.
+        """Write the square `view`, whose lowest cell is `corner`, clipped to the world.
 
-        With `seen`, of the view's shape, only where it is True.
+        `seen`, of the view's shape, limits this to cells where it is True.
         """
         size = view.shape[0]
         for key, tile_part, view_part in self._overlaps(corner, size):
@@ -58,14 +58,14 @@ class RobotMap:
     def _overlaps(
         self, corner: tuple[int, int], size: int
     ) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
-        """Yield each tile that shares cells, with the parts of tile and window."""
+        """Yield each tile that overlaps the window, and the overlap as slices of both."""
         spans_y = list(self._spans(corner[1], size))
         for tile_x, in_tile_x, in_window_x in self._spans(corner[0], size):
             for tile_y, in_tile_y, in_window_y in spans_y:
                 yield (tile_x, tile_y), (in_tile_x, in_tile_y), (in_window_x, in_window_y)
 
     def _spans(self, start: int, size: int) -> Iterator[tuple[int, slice, slice]]:
-        """The same along one axis, clipped to the world."""
+        """Yield the overlaps along one axis, clipped to the world."""
         low, end = max(start, 0), min(start + size, self._world_size)
         while low < end:
             tile = low // TILE_SIZE
@@ -85,7 +85,7 @@ class RobotMemory:
         self._world_size = parameters.world_size
         self._unseen = parameters.unseen
         self._cells = SharedCells(parameters) if parameters.shared_map_cell else None
-        # Others' maps fill the gaps, so these must be NaN.
+        # NaN marks the gaps, which others' maps fill.
         self._map = RobotMap(parameters.world_size, math.nan if self._cells else self._unseen)
         self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
         # For display: seen cells of a coarse raster over the world.
@@ -94,8 +94,8 @@ class RobotMemory:
     def observe(self, position: F64, view: F32, seen: Bools | None = None) -> None:
         """Write the sensor's view (sensor_size, sensor_size) around `position` into the map.
 
-        With `seen`, of the same shape, only where it is True. A cell of `explored` counts as seen
-        if its centre was.
+        `seen`, of the same shape, limits this to cells where it is True. A cell of `explored` is
+        set if its centre was seen.
         """
         size = view.shape[0]
         corner = window_corner(position, size)
@@ -128,7 +128,7 @@ class RobotMemory:
     def local_map(self, position: F64) -> F32:
         """Map (local_map_size, local_map_size) around `position`, valid until the next call.
 
-        `PerceptionParameters.unseen` in unknown cells; 0 outside the world.
+        Unknown cells are `PerceptionParameters.unseen`; cells outside the world are 0.
         """
         corner = window_corner(position, self._local.shape[0])
         self._map.window(corner, self._local)

@@ -21,7 +21,7 @@ class ServiceManager:
     """Sender of notifications; does nothing unless systemd started this program."""
 
     def __init__(self) -> None:
-        """Take the socket's name out of the environment, so that child processes cannot use it."""
+        """Remove the socket's name from the environment, so that child processes cannot use it."""
         name = os.environ.pop("NOTIFY_SOCKET", "")
         for variable in ("WATCHDOG_USEC", "WATCHDOG_PID"):
             os.environ.pop(variable, None)
@@ -34,7 +34,7 @@ class ServiceManager:
         self._socket.close()
 
     def notify(self, *assignments: str) -> None:
-        """Send assignments. Never waits, never raises OSError: an unread one is dropped."""
+        """Send assignments. Never waits or raises OSError: drops them if they cannot be sent."""
         if self._address and assignments:
             with suppress(OSError):
                 data = "\n".join(assignments).encode()
@@ -50,11 +50,11 @@ def status_text(
     peers: int,
     insecure: bool,
 ) -> str:
-    """`STATUS=` and one JSON object: ASCII, below 3,000 characters, since systemd takes 4 kB.
+    """`STATUS=` and one JSON object: ASCII, below 3,000 characters, since systemd's limit is 4 kB.
 
-    `monotonic_s` lets readers compute the status's age. `autopilot`: its telemetry is fresh.
-    `ages_s`: time since each loop's last successful tick; None before the first. `peers`: number of
-    connected zenoh sessions. `insecure`: anyone on the network can fly the robot.
+    `monotonic_s` lets readers compute the status's age. `autopilot`: whether its telemetry is
+    fresh. `ages_s`: time since each loop's last successful tick; None before the first. `peers`:
+    number of connected zenoh sessions. `insecure`: whether anyone on the network can fly the robot.
     """
     text = {
         "monotonic_s": round(monotonic_s, 3),
@@ -73,7 +73,7 @@ def status_text(
         },
         "peers": peers,
         "insecure": insecure,
-        # The link is open from before the loops start until after they end.
+        # The link opens before the loops start and closes after they end.
         "link": True,
         "bundle_id": status.bundle_id,
         "world_id": status.world_id,

@@ -1,4 +1,4 @@
-"""Makes records of the missions in flight logs, and notes for the reader."""
+"""Records of the missions in flight logs, with notes for the reader."""
 
 import contextlib
 import math
@@ -25,7 +25,7 @@ _MOST_NOTES = 3  # in one line
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """A policy's world, as in `FleetSetup`, and the text of the world file of a flight."""
+    """Sizes of a policy's world, as in `FleetSetup`, and the text of a flight's world file."""
 
     world_size: int
     sensor_size: int
@@ -38,9 +38,11 @@ class _World:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """Scope of a report: `missions` by name (none: all), with snapshots at `times_s` (none: at 0, a
-    quarter, half and all of each), over the world in `world`, for the policy in `bundle`.
-    `world_option` names the world's option in messages.
+    """Scope of a report.
+
+    `missions` are names; empty for all. `times_s` are those of snapshots; empty for 0, a quarter,
+    half and all of each mission. `world` is the world's file, `bundle` the policy's. Messages call
+    the world's option `world_option`.
     """
 
     missions: tuple[str, ...] = ()
@@ -58,7 +60,7 @@ class Wanted:
 class Examined(NamedTuple):
     """Records of the missions in some logs, and notes for the reader.
 
-    `without_cost` has the reason for each mission whose cost is unknown, by name.
+    `without_cost` maps the name of each mission whose cost is unknown to the reason.
     """
 
     records: tuple[FlightRecord, ...]
@@ -80,7 +82,7 @@ def examine(
 ) -> Examined:
     """Examine the logs below `folders`.
 
-    Calls `progress` with the present step and the share that is done. Raises ValueError if there
+    Calls `progress` with the current step and the share done. Raises ValueError if there
     are no logs or no missions in them, OSError if something cannot be read.
     """
     paths = [Path(folder) for folder in folders]
@@ -102,12 +104,12 @@ def examine(
         records.append(record)
         if not len(record.normalized):
             why = "; ".join(notes[before:])
-            without_cost[record.name] = why or f"{record.name}: no cost is known"
+            without_cost[record.name] = why or f"{record.name}: the cost is unknown"
     return Examined(tuple(records), tuple(notes), without_cost)
 
 
 def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission]:
-    """Select missions. Raises ValueError that names the existing ones."""
+    """Select the wanted missions. Raises ValueError that names those in the logs."""
     if not missions:
         robots = len(logs.statuses)
         notes = "".join(f"; {note}" for note in logs.notes[:_MOST_NOTES])
@@ -147,8 +149,8 @@ class _Worlds:
     def of(self, mission: Mission) -> tuple[Coverage | None, int]:
         """The world of the mission's flight, and the width of the robots' sensor in cells.
 
-        The world is None, with a note, if it is not found. Raises BundleError for a given bundle
-        that cannot be loaded or has no perception.
+        The world is None, with a note, if it is not found. Raises BundleError if the given
+        bundle cannot be loaded or has no perception.
         """
         statuses = [
             status
@@ -185,7 +187,7 @@ class _Worlds:
         return self._coverages[world]
 
     def _without_text(self, mission: Mission, bundle_ids: set[str]) -> _World:
-        """Sizes from the ground's log of the flown policies, else from a policy's bundle."""
+        """Sizes from the ground's log, else from the bundle of a flown policy."""
         setups = [setup for setup in self._logs.setups if setup[1].bundle_id in bundle_ids]
         if setups and self._bundle is None:
             before = [setup for at_s, setup in setups if at_s <= mission.end_s]
@@ -263,23 +265,23 @@ def _values(record: FlightRecord) -> dict[str, Any]:
         "robots": [robot.name for robot in record.robots],
         "worlds": list(record.world_ids),
         "cost": {
-            "initial": _first(record.cost, 0),
-            "final": _first(record.cost, -1),
-            "normalized": _first(record.normalized, -1),
+            "initial": _entry(record.cost, 0),
+            "final": _entry(record.cost, -1),
+            "normalized": _entry(record.normalized, -1),
             "lloyd": finite(record.lloyd),
             "normalized_lloyd": finite(record.normalized_lloyd),
             "time_s": record.curve_time_s[: len(record.normalized)].round(3).tolist(),
             "curve": record.normalized.round(6).tolist(),
         },
-        "separation": _apart(record.separation),
+        "separation": _as_dict(record.separation),
         "fence_margin_m": finite(record.fence_margin_m),
         "truth": {
             "cost": {
-                "initial": _first(record.true_cost, 0),
-                "final": _first(record.true_cost, -1),
-                "normalized": _first(record.normalized_true, -1),
+                "initial": _entry(record.true_cost, 0),
+                "final": _entry(record.true_cost, -1),
+                "normalized": _entry(record.normalized_true, -1),
             },
-            "separation": _apart(record.true_separation),
+            "separation": _as_dict(record.true_separation),
             "fence_margin_m": finite(record.true_fence_margin_m),
         }
         if record.truth
@@ -312,9 +314,9 @@ def _values(record: FlightRecord) -> dict[str, Any]:
     }
 
 
-def _apart(separation: Separation | None) -> dict[str, Any] | None:
+def _as_dict(separation: Separation | None) -> dict[str, Any] | None:
     return None if separation is None else separation._asdict()
 
 
-def _first(values: Any, index: int) -> float | None:
+def _entry(values: Any, index: int) -> float | None:
     return finite(float(values[index])) if len(values) else None

@@ -19,7 +19,7 @@ def title_of(middleware: str) -> str:
 
 
 def of_restarts(runs: Sequence[Run]) -> Figure:
-    """A dot for each run, and each middleware's mean and standard deviation."""
+    """Plot each run as a dot, and each middleware's mean and standard deviation."""
     with style.figure(style.WIDTH_IN, 2.4) as figure:
         panels = figure.subplots(1, 3)
         measures = (
@@ -58,7 +58,7 @@ def of_restarts(runs: Sequence[Run]) -> Figure:
 
 
 def over_robots(runs: Sequence[Run]) -> Figure:
-    """Throughput, and the age of messages, over the number of robots."""
+    """Plot throughput and the age of messages over the number of robots."""
     with style.figure(style.WIDTH_IN, 2.9) as figure:
         left, right = figure.subplots(1, 2)
         of_each = summaries(runs)

@@ -38,7 +38,7 @@ _QOS = Qos(
     Policy.Durability.Volatile,
 )
 _MOST_AT_ONCE = 100
-_LOOK_UP_EVERY = duration(milliseconds=200)
+_WAIT_TIMEOUT = duration(milliseconds=200)
 # On Wi-Fi, Cyclone DDS discovers by multicast and sends data to each peer, but it does not
 # recognise the interface of a network namespace as Wi-Fi.
 _WIFI = """<CycloneDDS><Domain><General>
@@ -104,7 +104,7 @@ class _CyclonePeer:
         news = SampleState.NotRead | ViewState.Any | InstanceState.Any
         arrivals.attach(ReadCondition(self._reader, news))
         while not self._closed.is_set():
-            arrivals.wait(_LOOK_UP_EVERY)
+            arrivals.wait(_WAIT_TIMEOUT)
             for sample in self._reader.take(_MOST_AT_ONCE):
                 # Otherwise a sample announces the end of a writer.
                 if isinstance(sample, Bytes):

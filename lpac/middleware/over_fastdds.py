@@ -1,6 +1,6 @@
 """Adapter of Fast DDS, with ROS 2's default quality of service.
 
-There is no Python package: `fast_dds.cpp` is compiled once against the installed library.
+It has no Python package, so `fast_dds.cpp` is compiled once against the installed library.
 """
 
 import ctypes
@@ -21,9 +21,9 @@ from edge.messages.topics import MESSAGE, TOPICS
 from lpac.middleware.kinds import Peer
 
 _SOURCE = Path(__file__).with_name("fast_dds.cpp")
-# As in `over_cyclone`: one measurement runs the two one after another.
+# As in `over_cyclone`: a measurement never runs both at once.
 _DOMAINS, _PORTS_OF_A_BLOCK = 50, 200
-_LOOK_UP_EVERY_MS = 200
+_TAKE_TIMEOUT_MS = 200
 _MOST_BYTES = 2**20
 _TOPICS = (MESSAGE, *(t for t in TOPICS if t.sender == "robot" and t != MESSAGE))
 
@@ -42,7 +42,7 @@ def _library() -> ctypes.CDLL | None:
     name = hashlib.sha256(_SOURCE.read_bytes()).hexdigest()[:16]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lpac-edge"
     compiled = folder / f"fast-dds-{name}.so"
-    # Loading fails after Fast DDS was upgraded.
+    # Loading fails after an upgrade of Fast DDS.
     with suppress(OSError):
         return _loaded(compiled)
     with suppress(OSError, subprocess.CalledProcessError):
@@ -107,7 +107,7 @@ class _FastPeer:
     def _take(self) -> None:
         buffer = ctypes.create_string_buffer(_MOST_BYTES)
         while not self._closed.is_set():
-            size = self._library.fast_dds_take(self._peer, buffer, _MOST_BYTES, _LOOK_UP_EVERY_MS)
+            size = self._library.fast_dds_take(self._peer, buffer, _MOST_BYTES, _TAKE_TIMEOUT_MS)
             if size > 0:
                 self._receive(ctypes.string_at(buffer, size))
 

@@ -1,4 +1,4 @@
-"""Places of robots' programs in the network, and the processes there."""
+"""Network namespaces in which robots' programs run, and their processes."""
 
 import contextlib
 import json
@@ -54,7 +54,7 @@ def place_in(namespace: str) -> NetworkPlace:
 
 
 class Notifier:
-    """Condition that is notified of lines and ends of several programs."""
+    """Condition notified of each output line and exit of several programs."""
 
     def __init__(self) -> None:
         self._changed = Condition()
@@ -79,13 +79,13 @@ class Notifier:
 class Program:
     """A module of this package as a process at a place; a context manager that ends it.
 
-    The process also ends with this one, in any case, since its standard input closes.
+    The process also ends with this one, since its standard input closes.
     """
 
     def __init__(
         self, place: NetworkPlace, notifier: Notifier, on_line: Callable[[str], None], *command: str
     ) -> None:
-        """`command` is a module and its arguments; `on_line` gets its output, from a thread."""
+        """`command` is a module and its arguments; a thread passes output to `on_line`."""
         self._command = command
         self._notifier = notifier
         self._on_line = on_line
@@ -99,7 +99,7 @@ class Program:
             stderr=self._errors,
             text=True,
             bufsize=1,
-            # Ctrl-C is handled by this process alone.
+            # Only this process handles Ctrl-C.
             start_new_session=True,
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         )
@@ -122,7 +122,7 @@ class Program:
         self._errors.close()
 
     def leave(self) -> None:
-        """Ask the process to end. With several programs, ask all before waiting for one."""
+        """Ask the process to end. With several programs, ask all before waiting for any."""
         self._leaving = True
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):

@@ -1,6 +1,6 @@
 """A policy's inputs in a mirrored or turned world.
 
-`turned` is 0 (unchanged) to 7: bit 0 mirrors x, bit 1 mirrors y, bit 2 swaps the two.
+`turned` is 0 (unchanged) to 7: bit 0 mirrors x, bit 1 mirrors y, bit 2 then swaps x and y.
 """
 
 from collections.abc import Sequence
@@ -15,15 +15,15 @@ _Array = npt.NDArray[Any]
 
 
 def turned_vectors(vectors: _Array, turned: int) -> _Array:
-    """Vectors (R, 2) about the origin."""
+    """Mirror or turn vectors (R, 2) about the origin."""
     signs = np.array([-1.0 if turned & 1 << axis else 1.0 for axis in range(2)], vectors.dtype)
     mirrored = vectors * signs
     return np.ascontiguousarray(mirrored[:, ::-1] if turned & 4 else mirrored)
 
 
 def turned_images(images: _Array, channels: Sequence[str], turned: int) -> _Array:
-    """Images (R, channels, size, size) of `edge.policy.images`."""
-    # Channels that change sign or order.
+    """Mirror or turn images (R, channels, size, size) of `edge.policy.images`."""
+    # These channels also change sign or order.
     plane = [channels.index(name) for name in NEIGHBOURS if name in channels]
     for axis in range(2):
         if turned & 1 << axis:

@@ -1,7 +1,7 @@
 """UDP socket between MAVSDK and the vehicle, which drops duplicate and late frames.
 
-MAVSDK's own socket reports neither sequence numbers nor senders. Duplicate and late frames would
-then count as new, and lost ones could not be counted.
+MAVSDK's own socket reports neither sequence numbers nor senders. With it, duplicate and late
+frames would count as new, and lost ones could not be counted.
 """
 
 import socket
@@ -18,7 +18,7 @@ from edge.drivers.px4.reception import Frame, VehicleFrames
 _AUTOPILOT = 1  # component id
 _BYTES = 65535
 _RECEIVE_TIMEOUT_S = 0.2
-# Message -> format of the vehicle's time at the payload's begin, and its unit, s.
+# Message -> format of the vehicle's time at the payload's start, and its unit, s.
 _TIMES = {
     32: (struct.Struct("<I"), 1e-3),  # LOCAL_POSITION_NED
     33: (struct.Struct("<I"), 1e-3),  # GLOBAL_POSITION_INT
@@ -37,7 +37,7 @@ class LinkState(NamedTuple):
 class Datagrams:
     """One UDP port; its thread passes accepted frames to a callback.
 
-    Outgoing frames go to the sender of the vehicle's frames. Thread-safe.
+    Outgoing frames go to the address that sent the vehicle's frames. Thread-safe.
     """
 
     def __init__(self, host: str, port: int, on_frames: Callable[[bytes], None]) -> None:
@@ -45,7 +45,7 @@ class Datagrams:
         self._system_id: int | None = None
         self._on_frames = on_frames
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        # `edge.drivers.px4.unattended` may still have the port.
+        # `edge.drivers.px4.unattended` may still have the port open.
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((host, port))
@@ -74,7 +74,7 @@ class Datagrams:
         self._socket.close()
 
     def send(self, data: bytes) -> None:
-        """Send to the vehicle, if a frame of it was received."""
+        """Send to the vehicle. Does nothing before its first frame."""
         with self._lock:
             reception = self._receptions.get(self._system_id or 0)
             path = None if reception is None else reception.path

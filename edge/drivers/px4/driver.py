@@ -12,7 +12,7 @@ from edge.drivers.px4.watchdog import WatchdogProcess
 
 
 def vehicle_lock(port: int) -> ProcessLock:
-    """Lock against other programs of this machine that use the vehicle on that UDP port."""
+    """Lock that keeps this machine's other programs from the vehicle on that UDP port."""
     return ProcessLock(f"the autopilot's port {port}")
 
 

@@ -1,10 +1,9 @@
 """Watchdog process: commands hold when the robot's control loop falls silent.
 
-A process of its own, it still runs when a loop, the interpreter or the whole program hangs. It
-lands a vehicle that it commanded to hold and that nobody has taken since. If the watchdog dies too,
-PX4's own failsafe lands the vehicle a moment later. It loads the standard library only, to need
-little memory, and sends its two MAVLink messages through the socket that the robot's program uses
-for PX4.
+As a separate process it survives a hang of a loop, the interpreter or the whole program. After its
+hold command it lands the vehicle unless somebody has taken it. If the watchdog dies too, PX4's own
+failsafe lands the vehicle a moment later. To save memory it loads the standard library only. Its
+two MAVLink messages go through the socket that the robot's program uses for PX4.
 """
 
 import os
@@ -25,7 +24,7 @@ _REPEATS, _REPEAT_S = 3, 0.1
 _DATAGRAM_BYTES = 1
 
 _WATCHDOG = 197  # component id
-# Until then datagrams stay in the socket: a program that recovers has missed none.
+# Datagrams stay in the socket this long, so that a program that recovers misses none.
 _KEEP_DATAGRAMS_S = 3.0
 # The path of an isolated interpreter does not include the package.
 _PROGRAM = """
@@ -44,7 +43,7 @@ class WatchdogProcess:
     """Context that starts, feeds and ends the watchdog.
 
     The vehicle holds `timeout_s` after the last call of `feed`, if that had `flying=True`. It lands
-    `hover_land_s` after that call unless `feed` is called or anybody selects another mode.
+    `hover_land_s` after that call unless `feed` is called again or anybody selects another mode.
     """
 
     def __init__(self, port: int, system_id: int, timeout_s: float, hover_land_s: float) -> None:
@@ -68,7 +67,7 @@ class WatchdogProcess:
             [sys.executable, "-I", "-S", "-c", _PROGRAM, root, *map(str, numbers)],
             stdin=subprocess.DEVNULL,
             pass_fds=(reader, udp),
-            # It must end with the robot's program, not by the terminal's signals.
+            # The terminal's signals must not end it: it ends with the robot's program.
             start_new_session=True,
         )
         os.close(reader)
@@ -81,7 +80,7 @@ class WatchdogProcess:
             self._process.wait()
 
     def feed(self, *, flying: bool) -> None:
-        """Report that the control loop runs; `flying`: PX4 follows its setpoints.
+        """Report that the control loop runs; `flying`: whether PX4 follows its setpoints.
 
         Called from the control thread only.
         """
@@ -105,7 +104,7 @@ def _socket_on(port: int) -> int:
             with socket.socket(fileno=os.dup(descriptor)) as found:
                 if found.type == socket.SOCK_DGRAM and found.getsockname()[1:2] == (port,):
                     return descriptor
-    raise WatchdogError(f"no UDP socket on port {port} to guard: check the autopilot's url")
+    raise WatchdogError(f"no UDP socket on port {port}: check the autopilot's url")
 
 
 def _watch(
@@ -113,13 +112,13 @@ def _watch(
 ) -> None:
     """Command hold whenever a flying robot falls silent, and then land the vehicle if unattended.
 
-    Returns when the pipe is closed, but not before a vehicle that holds has landed or was taken.
+    Returns once the pipe is closed and a vehicle in hold has landed or been taken.
     """
     peer: tuple[str, int] | None = None
     flying = held = False
     fed_s = time.monotonic()
     while True:
-        # Datagrams that the robot's program has not read yet show the vehicle's address.
+        # Unread datagrams show the vehicle's address.
         waited = [pipe] if peer else [pipe, udp.fileno()]
         readable, _, _ = select.select(waited, [], [], timeout_s)
         peer = _peer(udp) or peer
@@ -128,7 +127,7 @@ def _watch(
             print_line(f"control loop silent for {timeout_s} s: hold")
             held = True
             if not select.select([pipe], [], [], _KEEP_DATAGRAMS_S)[0]:
-                # The robot's program misses the datagrams read here; they would be old by then.
+                # Datagrams read here never reach the robot's program; they would be stale by then.
                 left_s = fed_s + hover_land_s - time.monotonic()
                 held = not land_unattended(udp, system_id, left_s, pipe, os.getppid())
         elif pipe not in readable:

@@ -1,4 +1,4 @@
-"""Flights of faults that keep their logs and a figure."""
+"""Flight of a fault that keeps its logs and a figure."""
 
 import shutil
 from collections.abc import Callable
@@ -10,17 +10,17 @@ from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.figure import write_figure
 from lpac.sim.drill.outcome import LATE_S, FlightOutcome, outcome_of
 
-# A promise broken on an overloaded machine says nothing: fly again.
+# A promise broken on an overloaded machine proves nothing: fly again.
 _TRIES = 3
 
 
 def fly_logged(fault: Fault, fly: Callable[[], FlightRecord], folder: Path) -> FlightOutcome:
-    """Fly into a new `folder` and judge; repeat if a promise broke while this machine was late.
+    """Fly, log to a new `folder` and judge; repeat if a promise broke while this machine was late.
 
     The files of late flights are kept next to `folder`, in NAME-late-1, and so on.
     """
 
-    def flown() -> FlightRecord:
+    def fly_once() -> FlightRecord:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         flight = fly()
@@ -32,7 +32,7 @@ def fly_logged(fault: Fault, fly: Callable[[], FlightRecord], folder: Path) -> F
         return flight
 
     for number in range(1, _TRIES + 1):
-        outcome = outcome_of(fault, flown)
+        outcome = outcome_of(fault, fly_once)
         if outcome.held or outcome.late_s <= LATE_S:
             break
         late = folder.with_name(f"{folder.name}-late-{number}")

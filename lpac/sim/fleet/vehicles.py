@@ -38,7 +38,7 @@ class Vehicles(Protocol):
         """Raise VehicleError if a vehicle has ended."""
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """Tracks of the vehicles until now, one each.
+        """Each vehicle's track until now.
 
         Times are `time.monotonic()`, positions north, east, down from the world's origin, m.
         """
@@ -47,7 +47,7 @@ class Vehicles(Protocol):
         """Drop the history of each vehicle."""
 
     def lost_s(self) -> float:
-        """Lateness of the vehicles behind real time, s."""
+        """Time by which the vehicles are behind real time, s."""
 
 
 def track_of(entries: Sequence[Truth]) -> TrueTrack:
@@ -72,9 +72,9 @@ def track_of(entries: Sequence[Truth]) -> TrueTrack:
 
 
 class SimulatedVehicles:
-    """`lpac.sim.px4` vehicles, which a thread of this process flies.
+    """`lpac.sim.px4` vehicles, simulated by a thread of this process.
 
-    Hold `stepped` to change `vehicles`, or their `links` to the robots' computers.
+    Hold `stepped` while changing `vehicles`, or `links`, their connections to robots' computers.
     """
 
     def __init__(self, vehicles: Sequence[Px4Vehicle]) -> None:
@@ -101,10 +101,10 @@ class SimulatedVehicles:
         self._server.__exit__()
 
     def require_running(self) -> None:
-        """Do nothing: they end with this process."""
+        """Do nothing: the vehicles run as long as this process."""
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """Tracks of the vehicles until now, all at the same times."""
+        """Each vehicle's track until now, all at the same times."""
         with self.stepped:
             truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
         started_s = self._server.started_s

@@ -205,7 +205,7 @@ def test_feeding_a_watchdog_that_was_killed_does_not_raise(
 
 def test_a_port_that_is_not_open_is_named() -> None:
     with (
-        pytest.raises(WatchdogError, match=r"^no UDP socket on port 9 to guard"),
+        pytest.raises(WatchdogError, match=r"^no UDP socket on port 9: check"),
         WatchdogProcess(9, system_id=7, timeout_s=0.5, hover_land_s=60.0),
     ):
         pass

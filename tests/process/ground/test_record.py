@@ -171,7 +171,7 @@ def test_it_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
 @pytest.mark.parametrize(
     ("below", "why"),
     [
-        ("", "is there already, and is no folder"),
+        ("", "already exists and is not a folder"),
         ("more/logs", "a part of this path is a file; a folder is needed"),
     ],
 )
