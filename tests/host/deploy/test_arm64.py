@@ -15,6 +15,7 @@ import pytest
 
 from edge.drivers.log_reader import read as read_log
 from edge.messages.mission import FlightState
+from edge.policy.bundle import load_bundle, write_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from lpac.analysis.policy_replay import replay
 from lpac.ground.station.protocol import SafetyCommand, Start
@@ -22,6 +23,7 @@ from tests.conftest import ROOT, SHIPPED
 from tests.host.conftest import BuildImage
 from tests.host.deploy.entering import inside
 from tests.robot_rig import Changes, Rig, new_vehicle, program, rig
+from tests.unit.export.test_module import Everything, export
 
 pytestmark = pytest.mark.real_time
 
@@ -98,10 +100,14 @@ def fetch_emulator(folder: Path) -> Path:
     return emulator
 
 
-def test_it_computes_what_torch_computed(tree: Path, tmp_path: Path) -> None:
-    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+@pytest.mark.parametrize("family", ["lpac", "network"])
+def test_it_computes_what_torch_computed(tree: Path, tmp_path: Path, family: str) -> None:
+    """Also what another network has: attention, memory and denoising."""
+    bundle = load_bundle(SHIPPED) if family == "lpac" else export(Everything())
+    tmp_path.chmod(0o755)
+    write_bundle(bundle, tmp_path / "bundle")
     result = subprocess.run(
-        inside(tree, tmp_path, "/usr/bin/lpac", "bundle", "verify", "/release"),
+        inside(tree, tmp_path, "/usr/bin/lpac", "bundle", "verify", "/release/bundle"),
         env=os.environ | ENVIRONMENT, capture_output=True, text=True, timeout=600.0, check=False,
     )  # fmt: skip
     assert (result.returncode, result.stderr) == (0, "")
