@@ -1,4 +1,4 @@
-"""Numbers of things as text."""
+"""Counts as text."""
 
 
 def counted(count: int, noun: str) -> str:

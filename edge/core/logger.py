@@ -1,7 +1,7 @@
-"""Logger of robot and ground, by structlog; the program chooses its output.
+"""The structlog logger of all programs; each program chooses its output.
 
-By default (before `edge.drivers.logs.log_to` of a robot) warnings and errors go to standard error
-as text. Pass an exception as `exc_info`.
+The default sends warnings and errors to standard error as text; robots then call
+`edge.drivers.logs.log_to`. Pass an exception as `exc_info`.
 """
 
 import sys
@@ -9,7 +9,7 @@ from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager
 from typing import Any, Literal
 
-# structlog imports rich if it is installed, for coloured tracebacks: 4 MB in each robot.
+# structlog imports rich, if installed, for coloured tracebacks: 4 MB of memory in each robot.
 _HIDDEN = {"rich"} - sys.modules.keys()
 sys.modules.update(dict.fromkeys(_HIDDEN))  # type: ignore[arg-type]
 import structlog  # noqa: E402
@@ -23,7 +23,7 @@ log: structlog.typing.FilteringBoundLogger = structlog.get_logger()
 def show(least: Literal["warning", "error"]) -> None:
     """Send lines of at least this level to standard error as text; drop all others."""
     structlog.configure(
-        [_in_words],
+        [_as_text],
         structlog.make_filtering_bound_logger(least),
         logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),
     )
@@ -40,7 +40,7 @@ def errors_only() -> Iterator[None]:
         structlog.configure(wrapper_class=before)
 
 
-def _in_words(_logger: object, _level: str, entry: MutableMapping[str, Any]) -> str:
+def _as_text(_logger: object, _level: str, entry: MutableMapping[str, Any]) -> str:
     event, raised = entry.pop("event"), entry.pop("exc_info", None)
     text = f"{event} ({raised!r})" if raised else str(event)
     details = "".join(f" {key}={value}" for key, value in entry.items())

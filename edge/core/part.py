@@ -1,4 +1,4 @@
-"""Errors and results of another package's code, as one line for its author."""
+"""Describe errors of third-party policies and sensors in one line for their author."""
 
 import traceback
 
@@ -6,13 +6,13 @@ import numpy as np
 
 
 class PartError(ValueError):
-    """A part of the robot, such as its policy or sensor, failed; the text is for people."""
+    """Failure of a part of the robot, such as its policy or sensor; the text is for people."""
 
 
 def in_one_line(error: Exception) -> str:
-    """Describe an exception, and the line of the package's own code that led to it.
+    """Describe an exception, and the last line in the part's own package that led to it.
 
-    A PartError has its text already.
+    Returns the text of a PartError unchanged.
     """
     if isinstance(error, PartError):
         return str(error)
@@ -21,7 +21,7 @@ def in_one_line(error: Exception) -> str:
         (*frame.f_code.co_filename.rpartition("/")[::2], line)
         for frame, line in traceback.walk_tb(error.__traceback__)
     ]
-    # The first place is the caller. Code below the package, such as numpy, says less to its author.
+    # The first frame is our caller's. Frames of libraries, such as numpy, help the author less.
     called = places[1:]
     if not called:
         return text

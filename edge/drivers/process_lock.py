@@ -9,8 +9,8 @@ from typing import Self
 class ProcessLock:
     """Context that reserves `what` for this process.
 
-    The lock is an abstract socket name. Like ports, these names are shared by all containers of one
-    network namespace. They need no file and vanish with their process.
+    The lock is an abstract socket name: it needs no file and vanishes with its process. Containers
+    in one network namespace share these names, as they share ports.
     """
 
     def __init__(self, what: str) -> None:

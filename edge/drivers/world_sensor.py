@@ -1,4 +1,4 @@
-"""Simulated sensor over a known world, for flights over a virtual importance density function."""
+"""Simulated sensor of a known world: robots fly over a virtual importance density function."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,7 +42,7 @@ def _sensor_over(setting: SensorSetting, text: str, source: str) -> WorldSensor:
     perception = setting.perception
     features = parse_world(text, source)
     if len(features) > MOST_FEATURES:
-        raise ValueError(f"{source}: has {len(features)} features, at most {MOST_FEATURES} may be")
+        raise ValueError(f"{source}: has {len(features)} features: must be at most {MOST_FEATURES}")
     importance = rasterize(
         features, perception.world_size, setting.idf_truncation, setting.idf_norm
     )

@@ -13,7 +13,7 @@ _JITTER = 0.12
 
 
 def title_of(middleware: str) -> str:
-    """The middleware's name for people."""
+    """Display name of a middleware."""
     known = MIDDLEWARES.get(middleware)
     return middleware if known is None else known.title
 

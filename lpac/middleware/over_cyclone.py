@@ -1,4 +1,4 @@
-"""Adapter of Cyclone DDS, with ROS 2's default quality of service."""
+"""Adapter for Cyclone DDS, with ROS 2's default quality of service."""
 
 import sys
 from collections.abc import Callable, Sequence

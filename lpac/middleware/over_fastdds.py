@@ -1,6 +1,6 @@
-"""Adapter of Fast DDS, with ROS 2's default quality of service.
+"""Adapter for Fast DDS, with ROS 2's default quality of service.
 
-It has no Python package, so `fast_dds.cpp` is compiled once against the installed library.
+Fast DDS has no Python package: `fast_dds.cpp` is compiled once against the installed library.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ from edge.messages.topics import MESSAGE, TOPICS
 from lpac.middleware.kinds import Peer
 
 _SOURCE = Path(__file__).with_name("fast_dds.cpp")
-# As in `over_cyclone`: a measurement never runs both at once.
+# The same domains as in `over_cyclone`: a measurement never runs both at once.
 _DOMAINS, _PORTS_OF_A_BLOCK = 50, 200
 _TAKE_TIMEOUT_MS = 200
 _MOST_BYTES = 2**20
@@ -42,7 +42,7 @@ def _library() -> ctypes.CDLL | None:
     name = hashlib.sha256(_SOURCE.read_bytes()).hexdigest()[:16]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lpac-edge"
     compiled = folder / f"fast-dds-{name}.so"
-    # Loading fails after an upgrade of Fast DDS.
+    # Fails after an upgrade of Fast DDS: then compile again.
     with suppress(OSError):
         return _loaded(compiled)
     with suppress(OSError, subprocess.CalledProcessError):

@@ -1,4 +1,4 @@
-"""Adapter of zenoh: the robots' own link, in a mesh, without keys."""
+"""Adapter for zenoh: the robots' own link, in a mesh, without keys."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager

@@ -1,4 +1,4 @@
-"""Reports of drills: README.md, CSV and JSON, and JUnit's XML for CI."""
+"""Reports of drills: README.md, CSV, JSON, and JUnit XML for CI."""
 
 import math
 import shlex
@@ -20,7 +20,7 @@ Outcomes = Mapping[PlannedFlight, FlightOutcome]
 
 
 class FaultSummary(NamedTuple):
-    """All flights of one fault; `worst` has the worst value of each figure."""
+    """Result of one fault's flights; `worst` has each figure's worst value."""
 
     fault: str
     flights: int
@@ -51,7 +51,7 @@ def _worst(outcomes: Iterable[FlightOutcome]) -> tuple[Figure, ...]:
 
 
 def repeat_command(flight: PlannedFlight) -> str:
-    """Command line that repeats a flight."""
+    """Shell command that repeats a flight."""
     scenario = flight.scenario
     words = ["lpac", "drill", "--fault", flight.scenario.fault, "--seed", str(scenario.seed)]
     words += ["-n", str(scenario.robots)]
@@ -93,15 +93,15 @@ def report_of(outcomes: Outcomes, made_by: Mapping[str, str]) -> Report:
     return Report(
         name="drill",
         title="Faults in flight",
-        text="Faults are injected into a fleet in flight. Promises are judged by the vehicles' "
-        "true positions.",
+        text="Each flight injects a fault into a fleet. Promises are judged by the vehicles' true "
+        "positions.",
         data=_json(outcomes),
         rows=list(_rows(outcomes)),
         tables=[
             Table(("fault", "promise", "kept", "nearest its limit"), rows, note="\n".join(note))
         ],
         figures=(),
-        flown=f"{first.scenario.robots} robots, {first.engine}",
+        flown=f"{counted(first.scenario.robots, 'robot')}, {first.engine}",
         made_by=made_by,
     )
 
@@ -121,7 +121,7 @@ def _why(outcome: FlightOutcome) -> str:
 
 
 def _json(outcomes: Outcomes) -> dict[str, Any]:
-    """For scripts: worst figures of each fault, and flights that broke a promise."""
+    """Content of drill.json: each fault's worst figures, and flights that broke a promise."""
     return {
         "faults": [
             {
@@ -163,7 +163,7 @@ def _rows(outcomes: Outcomes) -> Iterable[Sequence[object]]:
 
 
 def as_junit(outcomes: Outcomes) -> bytes:
-    """A JUnit test suite with a case per flight."""
+    """JUnit test suite, as XML, with a case per flight."""
     failed = [outcome for outcome in outcomes.values() if not outcome.held]
     suite = ElementTree.Element(
         "testsuite", name="lpac drill", tests=str(len(outcomes)), failures=str(len(failed))

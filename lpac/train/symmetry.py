@@ -23,7 +23,7 @@ def turned_vectors(vectors: _Array, turned: int) -> _Array:
 
 def turned_images(images: _Array, channels: Sequence[str], turned: int) -> _Array:
     """Mirror or turn images (R, channels, size, size) of `edge.policy.images`."""
-    # These channels also change sign or order.
+    # Neighbours' channels are vectors' x and y: these also change sign or order.
     plane = [channels.index(name) for name in NEIGHBOURS if name in channels]
     for axis in range(2):
         if turned & 1 << axis:

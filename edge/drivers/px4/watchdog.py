@@ -80,7 +80,7 @@ class WatchdogProcess:
             self._process.wait()
 
     def feed(self, *, flying: bool) -> None:
-        """Report that the control loop runs; `flying`: whether PX4 follows its setpoints.
+        """Report that the control loop runs; `flying`: whether PX4 follows the robot's setpoints.
 
         Called from the control thread only.
         """

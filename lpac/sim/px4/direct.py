@@ -1,4 +1,4 @@
-"""A simulated vehicle behind the robot's ports, in process, without a socket."""
+"""Simulated vehicle for a robot in the same process, without a socket."""
 
 import struct
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,10 +29,9 @@ _TIMES = {
 
 
 class DirectVehicle:
-    """A `Vehicle` and its `VehicleSetup`; `step` advances its time.
+    """`Vehicle` and `VehicleSetup` in one; `step` advances simulated time.
 
-    It exchanges MAVLink message objects, rounded as on a wire, so that the robot gets what PX4
-    sends, at PX4's rates.
+    Exchanges MAVLink message objects at PX4's rates, rounded as on the wire.
     """
 
     def __init__(self, vehicle: Px4Vehicle, system_id: int, clock: Clock) -> None:
@@ -44,8 +43,8 @@ class DirectVehicle:
         self._uploaded: tuple[FencePolygon, ...] = ()
         self._dialogue = Dialogue(self._telemetry)
         self._frames = VehicleFrames()
-        # Cached state with its time and command result, since a robot asks several times a tick;
-        # each step clears it.
+        # State, with its time and command result, for a robot that reads it several times a tick.
+        # Each step clears it.
         self._cached: tuple[float, ActionResult | None, VehicleState] | None = None
         # The link has no other subscriber, so messages that the robot does not read only cost time.
         self._link.silence(self._telemetry.messages)
@@ -64,7 +63,7 @@ class DirectVehicle:
             self._send_due(now_s)
 
     def state(self) -> VehicleState:
-        """The vehicle's state by its last messages."""
+        """State from the vehicle's last messages."""
         now_s, result = self._clock.monotonic_s(), self._dialogue.result
         if self._cached is None or self._cached[:2] != (now_s, result):
             state = self._telemetry.state(
@@ -75,7 +74,7 @@ class DirectVehicle:
         return self._cached[2]
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
-        """Send a setpoint once."""
+        """Send the setpoint once; returns it."""
         position_m = velocity_m_s = (0.0, 0.0, 0.0)
         if isinstance(setpoint, Velocity):
             mask, velocity_m_s = _VELOCITY_MASK, setpoint.velocity_local_m_s
@@ -96,11 +95,11 @@ class DirectVehicle:
         self._send_due(now_s)
 
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
-        """PX4's parameters; None for one that it does not have."""
+        """Values of PX4's parameters; None for those that it lacks."""
         return {name: self.vehicle.parameters.get(name) for name in names}
 
     def set_parameter(self, name: str, value: int | float) -> None:
-        """Set a parameter of PX4."""
+        """Set one of PX4's parameters."""
         self.vehicle.parameters[name] = value
 
     def upload_fence(self, vertices_deg: Sequence[tuple[float, float]]) -> None:
@@ -108,7 +107,7 @@ class DirectVehicle:
         self.vehicle.fence = self._uploaded = (FencePolygon(True, tuple(vertices_deg)),)
 
     def has_fence(self) -> bool:
-        """Whether it still has the uploaded fence."""
+        """Whether the vehicle still has the uploaded fence."""
         return bool(self._uploaded) and self.vehicle.fence == self._uploaded
 
     def _send_due(self, now_s: float) -> None:
@@ -141,8 +140,8 @@ class DirectVehicle:
 
 
 def _rounded(message: Any) -> Any:
-    """The message, its real numbers rounded in place to MAVLink's 32 bits."""
-    names, bits = _real_fields(message.__class__)
+    """Round the message's floats in place to MAVLink's 32 bits; returns the message."""
+    names, bits = _float_fields(message.__class__)
     if names:
         fields = vars(message)
         values = bits.unpack(bits.pack(*map(fields.__getitem__, names)))
@@ -151,8 +150,8 @@ def _rounded(message: Any) -> Any:
 
 
 @cache
-def _real_fields(kind: Any) -> tuple[tuple[str, ...], struct.Struct]:
-    """Names of a message's 32-bit reals, except arrays, and their packed form."""
+def _float_fields(kind: Any) -> tuple[tuple[str, ...], struct.Struct]:
+    """Names of a message's 32-bit floats, except arrays, and their packed format."""
     types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
     names = tuple(
         name
