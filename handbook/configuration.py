@@ -14,6 +14,7 @@ from msgspec import Meta
 from edge.core.schema import in_words
 from edge.policy.bundle import Manifest
 from edge.policy.lpac.manifest import LpacManifest
+from edge.policy.network.manifest import NetworkManifest
 from edge.robot.config import RobotConfig
 from export.parameters import PolicyParameters
 from handbook.markdown import cell, code, table
@@ -25,8 +26,10 @@ from lpac.radio.airtime import Wifi
 from lpac.sim.scenario import Scenario
 from lpac.study.drills import Drill
 from lpac.study.file import DRAWN, ConditionKeys, StudyFile
+from lpac.train.attention import AttentionNetwork
 from lpac.train.config import TrainingConfig
 from lpac.train.lpac import LpacNetwork
+from lpac.train.network import ModuleSource
 
 _ROOT = Path(__file__).resolve().parent.parent
 _REQUIRED = "must be given"
@@ -34,10 +37,10 @@ _REQUIRED = "must be given"
 ROBOT = (RobotConfig,)
 FLEET = (FleetTable, RobotTable)
 GROUND = (ScriptTable, *STEPS_BEFORE.values(), *STEPS.values(), SavedSite, Wifi)
-TRAINING = (TrainingConfig, LpacNetwork, PolicyParameters)
+TRAINING = (TrainingConfig, LpacNetwork, AttentionNetwork, ModuleSource, PolicyParameters)
 ABLATION = (AblationConfig,)
 STUDY = (StudyFile, ConditionKeys)
-MANIFEST = (Manifest, LpacManifest)
+MANIFEST = (Manifest, LpacManifest, NetworkManifest)
 
 
 def robot() -> str:
@@ -95,6 +98,8 @@ def training() -> str:
         _example("examples/field.toml"),
         *_tables(TrainingConfig, ""),
         *_tables(LpacNetwork, "network", '[network], family = "lpac"'),
+        *_tables(AttentionNetwork, "network", '[network], family = "attention"'),
+        *_tables(ModuleSource, "network", '[network], family = "network"'),
         "## Parameters of a checkpoint\n\nFile of `lpac export --params`, unless it is "
         "CoverageControl's own. `[perception]` and `[training]` are as above.",
         _example("policies/lpac_l2_k3_n10_512.toml"),
@@ -140,6 +145,7 @@ def manifest() -> str:
         "this file.",
         *_tables(Manifest, "", "Every family"),
         *_tables(LpacManifest, "", 'family = "lpac"'),
+        *_tables(NetworkManifest, "", 'family = "network"'),
     )
 
 

@@ -88,7 +88,7 @@ class ModuleNetwork:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _ModuleSource(Bounded):
+class ModuleSource(Bounded):
     """[network] of the family `network`: `module` is "package.module:Class" or "file.py:Class"."""
 
     module: str
@@ -96,7 +96,7 @@ class _ModuleSource(Bounded):
 
 def module_network(network: Mapping[str, object], where: str) -> ModuleNetwork:
     """See `LearnableFamily`."""
-    source = from_mapping(_ModuleSource, network, where)
+    source = from_mapping(ModuleSource, network, where)
     try:
         return ModuleNetwork(load_class(source.module))
     except ValueError as error:

@@ -47,7 +47,7 @@ class Maps(Bounded):
 
 @dataclass(frozen=True, slots=True)
 class TrainingRates(Bounded):
-    """TrainingRates at which the network was trained, Hz: of `encode` and of `step`."""
+    """Rates at which the network was trained, Hz: of `encode` and of `step`."""
 
     encode_hz: Positive = 5.0
     step_hz: Positive = 2.5
