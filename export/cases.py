@@ -1,12 +1,13 @@
 """Golden cases of a torch module: drawn inputs, and the module's outputs.
 
-Robots at random places exchange messages once, so that the messages and memories of a case are
+Robots at random places exchange messages, so that the messages and memories of a case are
 ones that the network makes. The module is tried with 0, 1, 3 and 30 neighbours.
 """
 
 import copy
 import io
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +30,10 @@ from export.parameters import PolicyParameters
 
 COUNTS = (0, 1, 3, 30)
 _SEED = 14
+# Of messages, so that one that grows with each is noticed.
+_EXCHANGES = 10
 _MAX_AGE_S = 0.8
+_FLOAT16_MAX = 65504.0
 # Relative change by another order of a sum.
 _REORDERED = {torch.float64: 1e-9, torch.float32: 1e-4}
 
@@ -65,8 +69,8 @@ class Cases:
 def golden_cases(module: nn.Module, contract: Contract, trained: PolicyParameters) -> Cases:
     """Run the module in float64, or in float32 if it computes in nothing else.
 
-    Raises ModuleError for outputs that robots refuse, and if the result depends on the number of
-    neighbours, or on their order unless the contract says so.
+    Raises ModuleError for outputs that robots refuse, and if the result is not the same for the
+    same inputs, or depends on the order of the neighbours and the contract does not say so.
     """
     cases = _Swarm(module, torch.float32, contract, trained).cases()
     try:
@@ -87,6 +91,10 @@ class _Swarm:
         self._module, self._dtype, self._contract = module, dtype, contract
         self._range = trained.perception.communication_range
         self._max_speed = trained.training.max_speed
+        messages = trained.messages
+        self._payload_limit = messages.payload_limit or (
+            _FLOAT16_MAX if "float16" in messages.payload_types else math.inf
+        )
         self._random = np.random.Generator(np.random.PCG64(_SEED))
 
     def cases(self) -> Cases:
@@ -96,19 +104,32 @@ class _Swarm:
         features = [
             self._encoded(robot % 7).outputs["features"] for robot in range(max(COUNTS) + 1)
         ]
-        first = [self._stepped(each, nobody, memory) for each in features]
-        step = [first[0]]
-        for robot, count in enumerate(COUNTS):
-            senders = [(robot + 1 + i) % len(first) for i in range(count)]
-            messages = np.array([first[sender].outputs["message"] for sender in senders])
-            step.append(
+        steps = [self._stepped(each, nobody, memory) for each in features]
+        first = steps[0]
+        for exchange in range(_EXCHANGES + 1):
+            # In the end, the numbers of neighbours that are kept.
+            counts = COUNTS if exchange == _EXCHANGES else [(3 * i) % 7 for i in range(len(steps))]
+            steps = [
                 self._stepped(
                     features[robot],
-                    messages.reshape(count, self._contract.message_size),
-                    first[robot].outputs.get("new_memory", memory),
+                    self._received(steps, robot, count),
+                    steps[robot].outputs.get("new_memory", memory),
                 )
+                for robot, count in enumerate(counts)
+            ]
+        return Cases(encode, [first, *steps])
+
+    def _received(self, steps: Sequence[Case], robot: int, count: int) -> F32:
+        """Messages (count, message_size) of the robots after this one."""
+        senders = [(robot + 1 + i) % len(steps) for i in range(count)]
+        messages = np.array([steps[sender].outputs["message"] for sender in senders], np.float32)
+        if (largest := np.abs(messages).max(initial=0.0)) > self._payload_limit:
+            raise ModuleError(
+                f"step: a message has the value {largest:.3g}: robots refuse more than "
+                f"{self._payload_limit:g}: scale it, or change payload_limit or payload_types of "
+                "[messages] in the parameter file"
             )
-        return Cases(encode, step)
+        return messages.reshape(count, self._contract.message_size)
 
     def _encoded(self, count: int) -> Case:
         maps, uniform = self._contract.maps, self._random.uniform
@@ -144,6 +165,12 @@ class _Swarm:
     ) -> Case:
         inputs = {name: drawn[name].astype(np.float32) for name in names}
         outputs = self._run(function, inputs, shapes)
+        again = self._run(function, inputs, shapes)
+        if any(not torch.equal(outputs[name], again[name]) for name in shapes):
+            raise ModuleError(
+                f"{function}: gives another result for the same inputs: what it keeps belongs into "
+                "memory, and noise into a persistent buffer"
+            )
         if not self._contract.depends_on_order:
             self._check_order(function, inputs, outputs)
         return Case(inputs, {name: values.float().numpy() for name, values in outputs.items()})

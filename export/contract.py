@@ -55,18 +55,21 @@ class Contract:
             if "maps" in _parameters(module, "encode"):
                 channels = tuple(getattr(module, "channels", MAP_CHANNELS[4]))
                 maps = Maps(channels, getattr(module, "image_size", 32))
-            rates = TrainingRates(*getattr(module, "rates_hz", ()))
-        except (TypeError, ValueError) as error:
+            rates = TrainingRates(*_rates_hz(module))
+        except ValueError as error:
             raise ModuleError(f"{type(module).__name__}: {error}") from None
         encode = _chosen(module, "encode", encode_inputs(maps))
         # Any features do to learn which inputs `step` names; their shape follows from `encode`.
         zeros = {name: np.zeros(sizes_of(array, 1), np.float32) for name, array in encode.items()}
-        [features] = call(module, "encode", zeros, torch.float32)
-        if not features.ndim:
-            raise ModuleError("encode gives a number: must give a tensor of one dimension or more")
+        features, *others = call(module, "encode", zeros, torch.float32)
+        if others or not features.ndim:
+            found = f"{1 + len(others)} tensors" if others else "a number"
+            raise ModuleError(f"encode gives {found}: must give a tensor of one dimension or more")
         step = _chosen(
             module, "step", step_inputs(tuple(features.shape), message_size, memory_size)
         )
+        if memory_size and "memory" not in step:
+            raise ModuleError(f"memory_size = {memory_size}, but step takes no memory")
         return cls(
             encode,
             step,
@@ -89,9 +92,18 @@ def _size(module: nn.Module, name: str, default: int | None = None) -> int:
     size = getattr(module, name, default)
     if not isinstance(size, int) or size < 0:
         raise ModuleError(
-            f"{type(module).__name__}: {name} = {size!r}: must be an attribute with an integer"
+            f"{type(module).__name__}: {name} = {size!r}: must be an attribute with an integer of "
+            "at least 0"
         )
     return size
+
+
+def _rates_hz(module: nn.Module) -> tuple[float, float]:
+    rates_hz = getattr(module, "rates_hz", (5.0, 2.5))
+    match rates_hz:
+        case (int() | float() as encode_hz, int() | float() as step_hz):
+            return float(encode_hz), float(step_hz)
+    raise ModuleError(f"{type(module).__name__}: rates_hz = {rates_hz!r}: must be two numbers")
 
 
 def _parameters(module: nn.Module, function: str) -> list[str]:
@@ -110,6 +122,7 @@ def _chosen(module: nn.Module, function: str, known: Mapping[str, Array]) -> dic
 
 
 def sizes_of(array: Array, neighbours: int) -> tuple[int, ...]:
+    """Shape of an array with so many neighbours."""
     return tuple(neighbours if isinstance(size, str) else size for size in array.shape)
 
 

@@ -5,6 +5,7 @@ import importlib
 import importlib.util
 import logging
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -21,6 +22,7 @@ from torch import Tensor, nn
 from edge.policy.bundle import SCHEMA_VERSION, Bundle, BundleError, Manifest, make_bundle
 from edge.policy.family import TOLERANCE
 from edge.policy.golden import GOLDEN
+from edge.policy.graph import Graph
 from edge.policy.images import EXPLORED
 from edge.policy.network.manifest import (
     ENCODE,
@@ -33,12 +35,11 @@ from edge.policy.network.manifest import (
 from edge.policy.network.policy import NetworkPolicy
 from export.cases import COUNTS, Case, golden_cases
 from export.checkpoint import CheckpointError, read_state_dict
-from export.contract import PER_NEIGHBOUR, Contract, ModuleError
+from export.contract import PER_NEIGHBOUR, Contract, ModuleError, with_neighbours
 from export.parameters import PolicyParameters, read_parameters
 
 _OPSET = 20
 _MOST_NEIGHBOURS = 1023
-_FLOAT16_MAX = 65504.0
 _RANDOM = {
     "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike", "RandomUniform",
     "RandomUniformLike",
@@ -55,6 +56,15 @@ def export_module(
     """
     trained = read_parameters(parameters)
     module = load_module(reference, checkpoint)
+    contract = Contract.of(module.eval())
+    if (
+        golden_cases(load_module(reference, checkpoint).eval(), contract, trained).file()
+        != golden_cases(module, contract, trained).file()
+    ):
+        raise ModuleError(
+            f"{reference}: its constructor draws numbers that the checkpoint does not have: "
+            "register them as a persistent buffer before training"
+        )
     provenance = {"module": reference.rpartition("/")[2]}
     for source, path in (("checkpoint", checkpoint), ("parameters", parameters)):
         if path is not None:
@@ -71,7 +81,11 @@ def load_module(reference: str, checkpoint: Path | None) -> nn.Module:
     module = load_class(reference)()
     if checkpoint is not None:
         try:
-            module.load_state_dict(read_state_dict(checkpoint))
+            state = read_state_dict(checkpoint)
+            for name, tensor in state.items():
+                if not tensor.isfinite().all():
+                    raise CheckpointError(f"{checkpoint}: {name}: has values that are not finite")
+            module.load_state_dict(state)
         except RuntimeError as error:
             problem = " ".join(str(error).split())
             raise CheckpointError(f"{checkpoint}: does not fit {reference}: {problem}") from None
@@ -88,8 +102,8 @@ def load_class(reference: str) -> Callable[[], nn.Module]:
         module = made()
     except ModuleNotFoundError as error:
         raise ModuleError(f"{reference}: {error}: run it where Python can import it") from None
-    except Exception as error:  # somebody else's code
-        raise ModuleError(f"{reference}: {type(error).__name__}: {error}") from None
+    except (Exception, SystemExit) as error:  # somebody else's code
+        raise ModuleError(f"{reference}: {_in_one_line(error)}") from None
     if not isinstance(module, nn.Module):
         raise ModuleError(f"{reference}: is a {type(module).__name__}: must be a torch.nn.Module")
     constructor: Callable[[], nn.Module] = made
@@ -132,7 +146,6 @@ def network_bundle(
     module = module.eval().requires_grad_(False)
     contract = Contract.of(module)
     cases = golden_cases(module, contract, trained)
-    _check_payloads(cases.step, trained)
     # Of the case with several neighbours.
     traced = COUNTS.index(3)
     graphs = {
@@ -170,9 +183,12 @@ def network_bundle(
     )
     files = {**graphs, GOLDEN: cases.file()}
     try:
-        checks = list(NetworkPolicy(make_bundle(manifest, files)).verify())
+        policy = NetworkPolicy(make_bundle(manifest, files))
     except BundleError as error:
-        raise ModuleError(f"the exported graphs cannot be run: {error}") from None
+        raise ModuleError(f"the exported graphs cannot be loaded: {error}") from None
+    _try(policy.encode_graph, "encode", cases.encode)
+    _try(policy.step_graph, "step", cases.step)
+    checks = list(policy.verify())
     worst = max(checks, key=lambda check: check.relative_error)
     # Six times the rounding here, for other processors.
     tolerance = max(TOLERANCE, float(f"{6.0 * worst.relative_error:.0e}"))
@@ -186,17 +202,16 @@ def network_bundle(
     return make_bundle(replace(manifest, parameters=network.parameters), files)
 
 
-def _check_payloads(steps: list[Case], trained: PolicyParameters) -> None:
-    """Raise ModuleError if robots would refuse a message."""
-    limit = trained.messages.payload_limit or (
-        _FLOAT16_MAX if "float16" in trained.messages.payload_types else float("inf")
-    )
-    largest = max(float(abs(case.outputs["message"]).max(initial=0.0)) for case in steps)
-    if largest > limit:
-        raise ModuleError(
-            f"step: a message has the value {largest:.3g}: robots refuse more than {limit:g}: "
-            "scale it, or change payload_limit or payload_types of [messages] in the parameter file"
-        )
+def _try(graph: Graph, function: str, cases: list[Case]) -> None:
+    """Raise ModuleError if onnxruntime cannot run a case, most often one without neighbours."""
+    for case in cases:
+        try:
+            graph.run(case.inputs)
+        except Exception as error:  # onnxruntime's exceptions share no base class
+            raise ModuleError(
+                f"{function}{with_neighbours(case.inputs)}: onnxruntime cannot run it: let the "
+                f"robot attend to itself, too ({_in_one_line(error)})"
+            ) from None
 
 
 class _Function(nn.Module):
@@ -231,9 +246,10 @@ def _graph(module: nn.Module, function: str, case: Case) -> bytes:
         assert program is not None
         graph = program.model_proto
     except Exception as error:  # torch raises many types for what it cannot trace
-        cause = error.__cause__ or error
-        text = " ".join(f"{type(cause).__name__}: {cause}".split())
-        raise ModuleError(f"{function}: torch cannot trace it: {text[:300]}") from None
+        text = _in_one_line(error)
+        if "DataDependent" in text:
+            text = "it decides in Python by the value of a tensor: use torch.where"
+        raise ModuleError(f"{function}: torch cannot trace it: {text}") from None
     for value in graph.graph.input:
         if value.name in PER_NEIGHBOUR and not value.type.tensor_type.shape.dim[0].dim_param:
             raise ModuleError(
@@ -248,6 +264,13 @@ def _graph(module: nn.Module, function: str, case: Case) -> bytes:
     _strip(graph)
     content: bytes = graph.SerializeToString(deterministic=True)
     return content
+
+
+def _in_one_line(error: BaseException) -> str:
+    """The innermost cause, shortened."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return textwrap.shorten(f"{type(error).__name__}: {error}", 240, placeholder=" ...")
 
 
 def _strip(graph: onnx.ModelProto) -> None:

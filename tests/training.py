@@ -65,6 +65,7 @@ expert_flights = 0.5
 worlds = 2
 set_ups = ["n3"]
 duration_s = 1.0
+mission_s = 2.0
 every_epochs = 1
 
 [export]

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F32
+from edge.core.part import in_one_line
 from edge.policy.bundle import BundleError
 from edge.policy.family import GoldenCheck
 
@@ -39,7 +40,7 @@ def checks_of(
     except Exception as error:
         if isinstance(error, BundleError):
             raise
-        raise BundleError(f"{GOLDEN}: does not fit the graphs: {error}") from None
+        raise BundleError(f"{GOLDEN}: does not fit the graphs: {in_one_line(error)}") from None
 
 
 def relative_error(output: F32, golden: F32) -> float:

@@ -28,6 +28,8 @@ class Graph:
         # The board also runs the autopilot: no thread pool, no spinning.
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
+        # Its errors are raised, too.
+        options.log_severity_level = 4
         # The arena would keep the memory of the largest batch, that of verification: 4.5 MB.
         options.enable_cpu_mem_arena = False
         try:
@@ -51,6 +53,7 @@ class Graph:
 
     def run(self, inputs: Mapping[str, F32]) -> list[F32]:
         """The outputs, in the order given to the constructor, in new arrays."""
-        contiguous = {name: np.ascontiguousarray(values) for name, values in inputs.items()}
+        # `ascontiguousarray` would give a number a dimension.
+        contiguous = {name: np.asarray(values, order="C") for name, values in inputs.items()}
         outputs: list[F32] = self._session.run(self._outputs, contiguous)
         return outputs

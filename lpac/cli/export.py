@@ -63,6 +63,8 @@ def export(
         if ":" in source and not Path(source).exists():
             bundle = export_module(source, checkpoint, params, name)
         else:
+            if source.endswith(".py"):
+                raise ValueError(f"{source}: name the class, too: {source}:CLASS")
             Path(source).stat()  # names a missing file
             bundle = export_bundle(Path(source), params, name, cnn=cnn, force=force)
     write_bundle(bundle, output)

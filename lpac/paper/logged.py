@@ -21,7 +21,7 @@ from lpac.study.perturbation import absences_of, perturbed_by
 from lpac.study.rates import LOGGED_S, is_comparable, rates, results_of_logs
 from lpac.study.receiving_robot import message_bytes
 from lpac.study.report import Report
-from lpac.study.results import FAILS_ABOVE, MethodResult, conditions_json
+from lpac.study.results import FAILS_ABOVE, MethodResult, conditions_json, over_mission
 from lpac.study.sections import Section, perturbation, repeatability, snapshots
 from lpac.study.study import BASELINES, Condition, Method, TrainedBundle
 from lpac.study.summary import LEGEND, draw_conditions, rows_of, tables_of
@@ -243,6 +243,7 @@ def _by_team(
                 time_s=time_s,
                 curves=curves,
                 clairvoyant=of_clairvoyant[:, :, -1],
+                clairvoyant_over_mission=over_mission(time_s, of_clairvoyant),
                 best_of_ten=np.array([[record.normalized_lloyd for record in own]]),
                 lost_at_s=0.0,
             )

@@ -8,7 +8,8 @@ Costs are normalised by the world's initial cost with all robots. Definitions:
   and to the best of ten runs of Lloyd's algorithm on the true density. Neither is a bound. Over all
   worlds they are ratios of means, else world by world.
 - A world **fails** if it ends above `FAILS_ABOVE` x clairvoyant. Costs **rise again** if they end
-  more than 5 % above their own minimum.
+  more than 5 % above their own minimum. The **worst rise** is the largest share, at any time, by
+  which a cost is above its best before.
 - Where robots are lost in flight, baselines and Lloyd's algorithm never had them.
 """
 
@@ -35,6 +36,9 @@ from lpac.study.flights import CLAIRVOYANT, CostCurve, PlannedFlight
 from lpac.study.study import Condition, Method, Study
 
 FAILS_ABOVE = 1.5
+# When costs are shown of a flight that lasts as long: up to a battery's length.
+MISSION_TIMES_S = (60.0, 120.0, 300.0)
+_ROUNDING_S = 1e-6
 _RISEN = 1.05
 _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
 
@@ -44,13 +48,15 @@ class MethodResult:
     """Costs of a method under one condition, in S trainings over K worlds.
 
     `time_s` (C,), `curves` (S, K, C) are normalised costs. `clairvoyant` and `best_of_ten` (1, K)
-    are the normalised costs for comparison. `lost_at_s` is the time at which robots are lost.
+    are the normalised costs for comparison, `clairvoyant_over_mission` (1, K, M) those at the M of
+    `mission_times_s`. `lost_at_s` is the time at which robots are lost.
     """
 
     method: Method
     time_s: F64
     curves: F64
     clairvoyant: F64
+    clairvoyant_over_mission: F64
     best_of_ten: F64
     lost_at_s: float
 
@@ -58,6 +64,18 @@ class MethodResult:
     def final(self) -> F64:
         """(S, K)."""
         return self.curves[..., -1]
+
+    @property
+    def over_mission(self) -> F64:
+        """(S, K, M)."""
+        return over_mission(self.time_s, self.curves)
+
+    @property
+    def worst_rise(self) -> F64:
+        """(S, K): the largest share by which the cost rises above its best before."""
+        since = self.curves[..., self.time_s >= self.lost_at_s]
+        rise: F64 = (since / np.minimum.accumulate(since, axis=-1)).max(axis=-1) - 1.0
+        return rise
 
     @property
     def area(self) -> F64:
@@ -80,6 +98,18 @@ class MethodResult:
         since = self.curves[..., self.time_s >= self.lost_at_s]
         risen: Bools = self.final > _RISEN * since.min(axis=-1)
         return risen
+
+
+def mission_times_s(duration_s: float) -> tuple[float, ...]:
+    """Those of MISSION_TIMES_S that a flight reaches; its end if it reaches none."""
+    reached = [time_s for time_s in MISSION_TIMES_S if time_s <= duration_s + _ROUNDING_S]
+    return tuple(reached) or (duration_s,)
+
+
+def over_mission(time_s: F64, curves: F64) -> F64:
+    """Costs (..., M) of `curves` (..., C) at `time_s` (C,), at the M of `mission_times_s`."""
+    at_s = np.array(mission_times_s(float(time_s[-1])))
+    return curves[..., np.searchsorted(time_s, at_s + _ROUNDING_S) - 1]
 
 
 def results_of(
@@ -113,6 +143,9 @@ def _of_condition(
             time_s=np.array(flown[method.name][0][0].time_s),
             curves=costs[method.name] / initial[:, None],
             clairvoyant=costs[CLAIRVOYANT][:, :, -1] / initial,
+            clairvoyant_over_mission=over_mission(
+                np.array(flown[CLAIRVOYANT][0][0].time_s), costs[CLAIRVOYANT] / initial[:, None]
+            ),
             best_of_ten=best_of_ten / initial,
             lost_at_s=condition.lost.at_s if method.trained else 0.0,
         )
@@ -198,6 +231,20 @@ def _result_json(result: MethodResult, of_all: Iterable[MethodResult]) -> dict[s
             **_distribution(result.over_best_of_ten),
             "ratio_of_means": list(paired_bootstrap(final, result.best_of_ten, ratio_of_means)),
         },
+        "over_mission": [
+            {
+                "time_s": time_s,
+                "mean": float(costs.mean()),
+                "over_clairvoyant": float(costs.mean() / clairvoyant.mean()),
+            }
+            for time_s, costs, clairvoyant in zip(
+                mission_times_s(float(result.time_s[-1])),
+                np.moveaxis(result.over_mission, -1, 0),
+                np.moveaxis(result.clairvoyant_over_mission, -1, 0),
+                strict=True,
+            )
+        ],
+        "worst_rise": _distribution(result.worst_rise),
         "fails": _share_json(result.over_clairvoyant > FAILS_ABOVE),
         "rises_again": _share_json(result.rises_again),
         "above": {

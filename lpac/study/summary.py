@@ -58,6 +58,8 @@ LEGEND = (
     "vs clairvoyant: ratio to Lloyd's algorithm with knowledge of the world, of means and, world "
     "by world, p90\n"
     "vs best Lloyd: ratio to the best of ten such runs, in each world\n"
+    "over the mission: mean cost at that time, and in brackets over the clairvoyant's then; rise: "
+    "how far a cost rises above its best before, on average over the worlds and in the worst\n"
     f"{VERDICT_RULE}; otherwise they are not distinguishable"
 )
 
@@ -103,6 +105,9 @@ def _tables(data: Mapping[str, Any], condition: Mapping[str, Any]) -> Iterator[T
         f"{condition['name']}: {over}, {condition['scenario']['duration_s']:g} s",
         "\n".join(note),
     )
+    if len(results[0]["over_mission"]) > 1:
+        times = [f"{at['time_s']:g} s" for at in results[0]["over_mission"]]
+        yield Table(("over the mission", *times, "rise"), [_mission_row(each) for each in results])
     if policies and len(policies) < len(results):
         rows = [
             [baseline["name"], *(_against(policy, baseline["name"]) for policy in policies)]
@@ -132,6 +137,15 @@ def _row(result: Mapping[str, Any]) -> list[str]:
         f"{over['ratio_of_means'][0]:.3f}",
         f"{over['quantiles']['0.9']:.2f}",
         f"{result['over_best_of_ten']['ratio_of_means'][0]:.3f}",
+    ]
+
+
+def _mission_row(result: Mapping[str, Any]) -> list[str]:
+    rise = result["worst_rise"]
+    return [
+        result["name"],
+        *(f"{at['mean']:.3f} ({at['over_clairvoyant']:.2f})" for at in result["over_mission"]),
+        f"{100.0 * rise['mean'][0]:.0f} %, worst {100.0 * rise['worst']:.0f} %",
     ]
 
 

@@ -19,13 +19,16 @@ from lpac.study.study import Method
 from lpac.train.config import TrainingConfig
 from lpac.train.files import write_atomically
 from lpac.train.fit import EpochLoss
-from lpac.train.select import ClosedLoopCost, JudgedCandidate, flights_of, policy_of
+from lpac.train.select import ClosedLoopCost, JudgedCandidate, MissionCost, flights_of, policy_of
 from lpac.train.task import CLAIRVOYANT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelCard:
-    """Contents of the card. `shards` are the facts of each; hours are those of one machine."""
+    """Contents of the card. `shards` are the facts of each; hours are those of one machine.
+
+    `over_mission` has the policy's own costs under the name "".
+    """
 
     config: TrainingConfig
     expert: str
@@ -36,6 +39,7 @@ class ModelCard:
     losses: Sequence[EpochLoss]
     baselines: Mapping[BaselineName, ClosedLoopCost]
     int8: ClosedLoopCost
+    over_mission: Mapping[str, MissionCost]
     shards: Mapping[str, Mapping[str, Any]]
     fit_hours: float
     select_hours: float

@@ -180,12 +180,14 @@ class SelectConfig(Bounded):
     """Selection of the weights with the least mean final cost over validation worlds.
 
     Candidates fly over the first `worlds` of the set in each of `set_ups` (see `lpac evaluate`),
-    with message loss `loss`, every `every_epochs` epochs and at the end of each round.
+    with message loss `loss`, every `every_epochs` epochs and at the end of each round. The chosen
+    policy also flies for `mission_s`, a battery's time, for the model card.
     """
 
     worlds: AtLeastOne = 20
     set_ups: Annotated[tuple[str, ...], Meta(min_length=1)] = ("field",)
     duration_s: _Duration = 60.0
+    mission_s: _Duration = 300.0
     loss: Share = 0.0
     every_epochs: AtLeastOne = 5
 

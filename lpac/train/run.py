@@ -202,6 +202,7 @@ class TrainingRun:
         checkpoint = (folder / _CHECKPOINT).read_bytes()
         limit = _PAYLOAD_MARGIN * self._largest_payload(judged, pool)
         int8 = self._selection.with_payload("int8", folder / _BUNDLE, judged, pool)
+        over_mission = self._selection.over_mission(folder / _BUNDLE, judged, pool)
         worse = int8.mean > _MAX_COST_RATIO * best.cost.mean
         messages = PolicyMessages(
             limit if limit > 0.0 else None, FLOAT_PAYLOADS if worse else PAYLOAD_TYPES
@@ -219,6 +220,7 @@ class TrainingRun:
             losses=self._fit.losses,
             baselines=baselines,
             int8=int8,
+            over_mission=over_mission,
             shards=self._shards.facts,
             fit_hours=self._fit.seconds / 3600.0,
             select_hours=self._selection.seconds / 3600.0,
@@ -233,6 +235,9 @@ class TrainingRun:
             "checkpoint": str(self._folder / f"{name}.pt"),
             "selected": _judged_json(best),
             "candidates": [_judged_json(each) for each in self._selection.judged],
+            "over_mission": {
+                each or "policy": cost._asdict() for each, cost in over_mission.items()
+            },
             "baselines": {each: _cost_json(cost) for each, cost in baselines.items()},
             **{
                 f"below_{name.replace('-', '_')}": best.cost.mean < baselines[name].mean

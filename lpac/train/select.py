@@ -1,8 +1,9 @@
 """Selects weights by their closed-loop cost over validation worlds."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Pool
 from lpac.sim.kept import KeptOutcomes
 from lpac.study.flights import CostCurve, KeptFlights, PlannedFlight
+from lpac.study.results import mission_times_s, over_mission
 from lpac.study.study import Condition, Method, Study, TrainedBundle
 from lpac.study.worlds import SET_UPS
 from lpac.train.config import SelectConfig
@@ -48,6 +50,14 @@ class ClosedLoopCost(NamedTuple):
             float(costs.mean()), float(np.quantile(costs, 0.9)), float(costs.max()),
             int(costs.argmax()),
         )  # fmt: skip
+
+
+class MissionCost(NamedTuple):
+    """Mean cost over initial cost at `times_s`, and the worst rise above the best before."""
+
+    times_s: tuple[float, ...]
+    mean: tuple[float, ...]
+    worst_rise: float
 
 
 class JudgedCandidate(NamedTuple):
@@ -157,6 +167,17 @@ class Selection:
         costs = self._fly(flights, pool, lambda _: None).reshape(len(names), -1)
         return {name: ClosedLoopCost.of(of) for name, of in zip(names, costs, strict=True)}
 
+    def over_mission(self, path: Path, bundle: Bundle, pool: Pool) -> dict[str, MissionCost]:
+        """Costs of the policy, "", and of the baselines over a battery's time."""
+        select = replace(self._select, duration_s=self._select.mission_s)
+        methods = {"": policy_of(path, bundle)} | {
+            name: Method.of(name) for name in self._task.baselines
+        }
+        return {
+            name: _mission_cost(self._curves(flights_of(select, method, path), pool))
+            for name, method in methods.items()
+        }
+
     def with_payload(
         self, payload: PayloadType, path: Path, bundle: Bundle, pool: Pool
     ) -> ClosedLoopCost:
@@ -166,9 +187,27 @@ class Selection:
 
     def _fly(self, flights: list[PlannedFlight], pool: Pool, report: Callable[[int], None]) -> F64:
         """Final cost over initial cost of each flight."""
-        flown: dict[PlannedFlight, float] = {}
+        curves = self._curves(flights, pool, report)
+        return np.array([curve.cost[-1] / curve.cost[0] for curve in curves])
+
+    def _curves(
+        self,
+        flights: list[PlannedFlight],
+        pool: Pool,
+        report: Callable[[int], None] = lambda _: None,
+    ) -> list[CostCurve]:
+        flown: dict[PlannedFlight, CostCurve] = {}
         with closing(self._flights.fly(self._task.costs, flights, pool)) as outcomes:
             for flight, curve in outcomes:
-                flown[flight] = curve.cost[-1] / curve.cost[0]
+                flown[flight] = curve
                 report(len(flown))
-        return np.array([flown[flight] for flight in flights])
+        return [flown[flight] for flight in flights]
+
+
+def _mission_cost(curves: Sequence[CostCurve]) -> MissionCost:
+    costs = np.array([curve.cost for curve in curves])
+    costs /= costs[:, :1]
+    at = over_mission(np.array(curves[0].time_s), costs)
+    rise = costs / np.minimum.accumulate(costs, axis=1)
+    times_s = mission_times_s(curves[0].time_s[-1])
+    return MissionCost(times_s, tuple(at.mean(axis=0).tolist()), float(rise.max()) - 1.0)

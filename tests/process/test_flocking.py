@@ -32,7 +32,7 @@ LESS = {
         "rounds = 1\nflights = 5\nduration_s = 15.0\nepochs = 30"
     ),
     "worlds = 5\nduration_s = 40.0\nevery_epochs = 30": (
-        'worlds = 1\nset_ups = ["n5"]\nduration_s = 10.0\nevery_epochs = 40'
+        'worlds = 1\nset_ups = ["n5"]\nduration_s = 10.0\nmission_s = 10.0\nevery_epochs = 40'
     ),
 }
 

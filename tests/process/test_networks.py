@@ -31,7 +31,7 @@ LESS = {
         "rounds = 1\nflights = 1\nduration_s = 4.0\nepochs = 1"
     ),
     "worlds = 10\nevery_epochs = 10": (
-        'worlds = 1\nset_ups = ["n5"]\nduration_s = 4.0\nevery_epochs = 10'
+        'worlds = 1\nset_ups = ["n5"]\nduration_s = 4.0\nmission_s = 4.0\nevery_epochs = 10'
     ),
 }
 

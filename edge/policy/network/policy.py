@@ -25,8 +25,8 @@ class NetworkPolicy:
         self.manifest = bundle.manifest
         self.bundle_id = bytes.fromhex(bundle.id)
         self.network = network = NetworkManifest.of(bundle.manifest)
-        self._encode = Graph(bundle, ENCODE, _shapes(network.encode), network.encode_outputs)
-        self._step = Graph(bundle, STEP, _shapes(network.step), network.step_outputs)
+        self.encode_graph = Graph(bundle, ENCODE, _shapes(network.encode), network.encode_outputs)
+        self.step_graph = Graph(bundle, STEP, _shapes(network.step), network.step_outputs)
         self._golden = bundle.files[GOLDEN]
 
     @property
@@ -40,7 +40,7 @@ class NetworkPolicy:
 
     def verify(self) -> Iterator[GoldenCheck]:
         """Run both graphs on the golden inputs. Raises BundleError."""
-        return verify(self._encode, self._step, self.network, self._golden)
+        return verify(self.encode_graph, self.step_graph, self.network, self._golden)
 
     def logged_features(self, inputs: Mapping[str, F32]) -> F32:
         """See `edge.policy.family.Replayable`."""
@@ -55,7 +55,7 @@ class NetworkPolicy:
 
     def encode(self, inputs: Mapping[str, F32]) -> F32:
         """Features of the inputs that the manifest names."""
-        [features] = self._encode.run(inputs)
+        [features] = self.encode_graph.run(inputs)
         return features
 
     def logged_step(
@@ -79,7 +79,9 @@ class NetworkPolicy:
             "degree": np.array(neighbours.degree, np.float32),
             _MEMORY: memory,
         }
-        velocity, message, *new = self._step.run({name: inputs[name] for name in self.network.step})
+        velocity, message, *new = self.step_graph.run(
+            {name: inputs[name] for name in self.network.step}
+        )
         step = PolicyStep(velocity, message, {_MEMORY: memory})
         return step, new[0] if new else memory
 

@@ -23,7 +23,7 @@ from tests.conftest import ROOT, SHIPPED
 from tests.host.conftest import BuildImage
 from tests.host.deploy.entering import inside
 from tests.robot_rig import Changes, Rig, new_vehicle, program, rig
-from tests.unit.export.test_module import Everything, export
+from tests.unit.export.test_module import Everything, exported
 
 pytestmark = pytest.mark.real_time
 
@@ -103,7 +103,7 @@ def fetch_emulator(folder: Path) -> Path:
 @pytest.mark.parametrize("family", ["lpac", "network"])
 def test_it_computes_what_torch_computed(tree: Path, tmp_path: Path, family: str) -> None:
     """Also what another network has: attention, memory and denoising."""
-    bundle = load_bundle(SHIPPED) if family == "lpac" else export(Everything())
+    bundle = load_bundle(SHIPPED) if family == "lpac" else exported(Everything)
     tmp_path.chmod(0o755)
     write_bundle(bundle, tmp_path / "bundle")
     result = subprocess.run(

@@ -139,7 +139,7 @@ def test_mistakes_are_one_line(tmp_path: Path, shipped_bundle: Bundle, flown: Me
         "holds no flight log (*.mcap)": tmp_path / "empty",
         "absent.mcap": tmp_path / "absent.mcap",
         "was not written by a robot": tmp_path / "cut.mcap",
-        "images: is (1, 4, 16, 16); the policy needs (1, 4, 32, 32)": write_log(
+        "images has shape (1, 4, 16, 16): must be (1, 4, 32, 32)": write_log(
             tmp_path / "foreign", shipped_bundle,
             [(t, s, {**m, "images": np.zeros((1, 4, 16, 16), "f4")}) for t, s, m in flown],
         ),

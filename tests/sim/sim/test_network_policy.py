@@ -20,13 +20,13 @@ from lpac.sim.failure import Failure
 from lpac.sim.points import fly_points
 from lpac.sim.scenario import Scenario
 from tests.flown import PRECISE
-from tests.unit.export.test_module import Everything, Silent, export
+from tests.unit.export.test_module import Everything, Silent, exported
 
 
 @pytest.fixture(scope="module")
 def bundle() -> Bundle:
     """Attention, memory and denoising."""
-    return export(Everything())
+    return exported(Everything)
 
 
 def test_points_fly_alike_alone_and_in_a_batch(bundle: Bundle) -> None:
@@ -49,7 +49,7 @@ def test_messages_matter_and_a_network_may_send_none(bundle: Bundle) -> None:
     deaf = Scenario(robots=4, seed=3, duration_s=4.0, loss=1.0)
     heard, alone = fly_points(scenario, bundle), fly_points(deaf, bundle)
     assert (heard.positions_m != alone.positions_m).any()
-    silent = export(Silent())
+    silent = exported(Silent)
     assert load_policy(silent).message_size == 0
     assert fly_points(scenario, silent).message_counts["accepted"] > 0
 

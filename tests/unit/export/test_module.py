@@ -1,6 +1,8 @@
 """Any torch module with `encode` and `step` is exported, or refused in one line."""
 
 import io
+import itertools
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +17,9 @@ from edge.policy.family import Neighbourhood, Observation, verified
 from edge.policy.golden import GOLDEN
 from edge.policy.network.policy import NetworkPolicy
 from export.contract import ModuleError
-from export.module import load_module, network_bundle
+from export.module import export_module, load_module, network_bundle
 from export.parameters import PolicyMessages, PolicyParameters
+from tests.conftest import ROOT
 
 PARAMETERS = PolicyParameters(
     PerceptionParameters(
@@ -164,6 +167,68 @@ class DecidesByValue(Observing):
         return self.act(torch.cat([query, query])), query
 
 
+class Keeps(Observing):
+    def step(self, features: Tensor, messages: Tensor) -> tuple[Tensor, Tensor]:
+        self.before = getattr(self, "before", 0.0) + 0.1
+        query = self.query(features) + self.before
+        return self.act(torch.cat([query, messages.sum(dim=0)])), query
+
+
+class Grows(Observing):
+    def step(self, features: Tensor, messages: Tensor) -> tuple[Tensor, Tensor]:
+        query = self.query(features)
+        return self.act(torch.cat([query, query])), query + 10.0 * messages.sum(dim=0)
+
+
+class TwoFeatures(Reduction):
+    def encode(self, position: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        return position, position
+
+
+class MemoryNotTaken(Reduction):
+    memory_size = 3
+
+
+class OneRate(Reduction):
+    rates_hz = 5.0
+
+
+class OnlyOthers(Observing):
+    """An encoder over the neighbours, without the robot's own token."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.others = nn.TransformerEncoderLayer(MESSAGE, 2, 32, batch_first=True)
+
+    def step(self, features: Tensor, messages: Tensor) -> tuple[Tensor, Tensor]:
+        query = self.query(features)
+        received = self.others(messages[None])[0].sum(dim=0)
+        return self.act(torch.cat([query, received])), query
+
+
+class Scalar(Reduction):
+    """Takes the number of neighbours as a number, not as a list of one."""
+
+    def step(self, features: Tensor, messages: Tensor, degree: Tensor) -> tuple[Tensor, Tensor]:
+        share = torch.stack([degree, features[0]])
+        return share[1:] * degree + share, torch.tanh(self.query(features))
+
+
+class DrawsInConstructor(Reduction):
+    """The checkpoint does not have its noise."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.noise = torch.randn(2, generator=torch.Generator().manual_seed(next(_SEEDS)))
+
+    def step(self, features: Tensor, messages: Tensor, degree: Tensor) -> tuple[Tensor, Tensor]:
+        action, message = super().step(features, messages, degree)
+        return action + self.noise, message
+
+
+_SEEDS = itertools.count()
+
+
 class UnknownInput(Observing):
     def step(self, features: Tensor, battery: Tensor) -> tuple[Tensor, Tensor]:
         return self.act(self.query(features)), battery
@@ -199,6 +264,12 @@ def export(module: nn.Module, parameters: PolicyParameters = PARAMETERS) -> Bund
     return network_bundle(module, parameters, "network", {})
 
 
+@cache
+def exported(module: type[nn.Module]) -> Bundle:
+    """The module's bundle, made once."""
+    return export(module())
+
+
 def neighbourhood(count: int, message_size: int, seed: int = 0) -> Neighbourhood:
     rng = np.random.default_rng(seed)
     return Neighbourhood(
@@ -211,10 +282,10 @@ def neighbourhood(count: int, message_size: int, seed: int = 0) -> Neighbourhood
     )
 
 
-@pytest.mark.parametrize("module", [Reduction, Everything, KnownOrder, Silent])
+@pytest.mark.parametrize("module", [Reduction, Everything, KnownOrder, Silent, Scalar])
 def test_a_robot_computes_what_torch_computes(module: type[nn.Module], tmp_path: Path) -> None:
-    network = module()
-    write_bundle(export(network), tmp_path / "bundle")
+    network = module().eval()
+    write_bundle(exported(module), tmp_path / "bundle")
     policy = load_policy(load_bundle(tmp_path / "bundle"))
     assert isinstance(policy, NetworkPolicy)
     assert verified(policy).problem is None
@@ -256,7 +327,7 @@ def test_a_robot_computes_what_torch_computes(module: type[nn.Module], tmp_path:
 
 
 def test_the_manifest_names_all_that_the_graphs_take_and_give() -> None:
-    manifest = export(Everything()).manifest
+    manifest = exported(Everything).manifest
     assert manifest.family == "network"
     assert manifest.perception is not None and manifest.perception.unseen_as_nan
     network = manifest.parameters
@@ -273,11 +344,11 @@ def test_the_manifest_names_all_that_the_graphs_take_and_give() -> None:
     assert network["rates"] == {"encode_hz": 5.0, "step_hz": 2.5}
     assert (network["message_size"], network["memory_size"]) == (16, 12)
     assert network["order"] == "any"
-    assert export(KnownOrder()).manifest.parameters["order"] == "by robot id"
+    assert exported(KnownOrder).manifest.parameters["order"] == "by robot id"
 
 
 def test_the_same_module_gives_the_same_bundle_which_names_no_file_of_this_machine() -> None:
-    bundle = export(Everything())
+    bundle = exported(Everything)
     assert bundle.id == export(Everything()).id
     for content in bundle.files.values():
         assert str(Path(__file__).parent).encode() not in content
@@ -285,7 +356,7 @@ def test_the_same_module_gives_the_same_bundle_which_names_no_file_of_this_machi
 
 
 def test_golden_outputs_are_with_no_one_three_and_many_neighbours() -> None:
-    golden = np.load(io.BytesIO(export(Everything()).files[GOLDEN]))
+    golden = np.load(io.BytesIO(exported(Everything).files[GOLDEN]))
     steps = [golden[f"step/{case}/messages"].shape for case in range(5)]
     assert steps == [(0, 16), (0, 16), (1, 16), (3, 16), (30, 16)]
     assert not golden["step/0/memory"].any() and golden["step/4/memory"].any()
@@ -298,10 +369,16 @@ def test_golden_outputs_are_with_no_one_three_and_many_neighbours() -> None:
                   "independent, or set depends_on_order = True"),
         (ThreeNeighbours, "step with no neighbours: RuntimeError: mat1 and mat2 shapes cannot"),
         (NoneIsNan, "step with no neighbours: gives NaN or infinity"),
-        (Draws, "step: draws random numbers"),
+        (Draws, "step: gives another result for the same inputs"),
         (Shouts, "step: a message has the value .*: robots refuse more than 65504"),
         (DecidesInPython, r"fixed number of neighbours: use messages.shape\[0\]"),
-        (DecidesByValue, "step: torch cannot trace it: "),
+        (DecidesByValue, "step: torch cannot trace it: it decides in Python by the value"),
+        (Keeps, "step: gives another result for the same inputs: what it keeps belongs into"),
+        (Grows, "step: a message has the value .*: robots refuse more than 65504"),
+        (TwoFeatures, "encode gives 2 tensors: must give a tensor of one dimension"),
+        (MemoryNotTaken, "memory_size = 3, but step takes no memory"),
+        (OneRate, "OneRate: rates_hz = 5.0: must be two numbers"),
+        (OnlyOthers, "step with no neighbours: onnxruntime cannot run it: let the robot attend to"),
         (UnknownInput, "step takes 'battery': known are features, messages, positions"),
         (NoMessage, r"step with no neighbours: gives shapes \(2,\): must be action \(2,\), "
                     r"message \(16,\)"),
@@ -323,6 +400,19 @@ def test_a_message_beyond_the_manifest_limit_is_refused() -> None:
     )
     with pytest.raises(ModuleError, match=r"robots refuse more than 0\.01"):
         export(Reduction(), limited)
+
+
+def test_numbers_that_only_the_constructor_knows_are_refused(tmp_path: Path) -> None:
+    torch.save(DrawsInConstructor().state_dict(), tmp_path / "trained.pt")
+    parameters = ROOT / "examples" / "networks" / "memory.toml"
+    reference = f"{__name__}:DrawsInConstructor"
+    with pytest.raises(ModuleError, match="constructor draws numbers that the checkpoint does not"):
+        export_module(reference, tmp_path / "trained.pt", parameters)
+    state = Reduction().state_dict()
+    state["act.bias"][0] = torch.nan
+    torch.save(state, tmp_path / "nan.pt")
+    with pytest.raises(ValueError, match=r"nan\.pt: act\.bias: has values that are not finite"):
+        load_module(f"{__name__}:Reduction", tmp_path / "nan.pt")
 
 
 def test_a_module_is_found_by_its_file_or_its_package(tmp_path: Path) -> None:
