@@ -68,9 +68,10 @@ def test_its_candidates_flew_over_validation_worlds_only(
         json.loads(line)["seed"]
         for line in (trained[0] / "flights.jsonl").read_text().splitlines()[1:]
     ]
-    # Three candidates, the best one with int8 payloads, and three baselines, over two worlds.
+    # Three candidates, the best one with int8 payloads, and three baselines, over two worlds; then
+    # the best one and the baselines for a battery's time.
     seeds = {draw_world("validation", world, FIELD).seed for world in range(2)}
-    assert len(flown) == 14 and set(flown) == seeds
+    assert len(flown) == 22 and set(flown) == seeds
 
 
 def test_the_card_tells_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
@@ -78,6 +79,10 @@ def test_the_card_tells_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
     card = (folder / "README.md").read_text()
     for text in (told["bundle_id"], "12 states of swarms", "Licence: MIT", "| decentralized-cvt |"):
         assert text in card
+    over = told["over_mission"]
+    assert set(over) == {"policy", *told["baselines"]}
+    assert over["policy"]["times_s"] == (2.0,) and over["policy"]["worst_rise"] >= 0.0
+    assert f"| **small** | {over['policy']['mean'][0]:.3f} |" in card
     for figure in ("losses", "costs", "first-world", "worst-world"):
         assert (folder / "figures" / f"{figure}.png").stat().st_size > 5_000
 
