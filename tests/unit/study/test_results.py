@@ -12,7 +12,14 @@ from lpac.sim.failure import Failure, LostRobots
 from lpac.sim.scenario import Scenario
 from lpac.study.figures import pairs
 from lpac.study.flights import CLAIRVOYANT, CostCurve, PlannedFlight
-from lpac.study.results import as_json, results_of, verdict_of, worst_worlds
+from lpac.study.results import (
+    as_json,
+    mission_times_s,
+    over_mission,
+    results_of,
+    verdict_of,
+    worst_worlds,
+)
 from lpac.study.study import Condition, Method, Study, TrainedBundle
 from lpac.study.worlds import FIELD, SET_UPS
 from tests.conftest import SHIPPED
@@ -87,6 +94,18 @@ def test_with_losses_baselines_are_the_same_and_policies_are_not() -> None:
     without, lossy = RESULTS[PLAIN], RESULTS[LOSSY]
     assert np.array_equal(lossy[2].curves, without[2].curves)
     assert lossy[1].final.min() > without[1].final.max()
+
+
+def test_costs_of_a_long_flight_are_at_three_times_and_rises_count_from_the_best() -> None:
+    time_s = np.arange(0.0, 301.0, 20.0)
+    costs = np.interp(time_s, [0.0, 60.0, 80.0, 120.0, 140.0, 300.0], [1, 0.4, 0.3, 0.6, 0.5, 0.5])
+    assert over_mission(time_s, costs).tolist() == pytest.approx([0.4, 0.6, 0.5])
+    assert mission_times_s(300.0) == (60.0, 120.0, 300.0)
+    assert mission_times_s(150.0) == (60.0, 120.0)
+    assert mission_times_s(60.0) == (60.0,) and mission_times_s(10.0) == (10.0,)
+    long = replace(RESULTS[PLAIN][0], time_s=time_s, curves=costs[None, None])
+    assert long.worst_rise.tolist() == [[pytest.approx(1.0)]]
+    assert replace(long, lost_at_s=130.0).worst_rise[0, 0] == pytest.approx(0.0)
 
 
 def test_lost_robots_are_held_against_those_who_never_had_them() -> None:
