@@ -102,7 +102,7 @@ class _Swarm:
         nobody = np.zeros((0, self._contract.message_size), np.float32)
         memory = np.zeros(self._contract.memory_size, np.float32)
         features = [
-            self._encoded(robot % 7).outputs["features"] for robot in range(max(COUNTS) + 1)
+            encode[robot % len(encode)].outputs["features"] for robot in range(max(COUNTS) + 1)
         ]
         steps = [self._stepped(each, nobody, memory) for each in features]
         first = steps[0]
@@ -171,7 +171,7 @@ class _Swarm:
                 f"{function}: gives another result for the same inputs: what it keeps belongs into "
                 "memory, and noise into a persistent buffer"
             )
-        if not self._contract.depends_on_order:
+        if PER_NEIGHBOUR & inputs.keys() and not self._contract.depends_on_order:
             self._check_order(function, inputs, outputs)
         return Case(inputs, {name: values.float().numpy() for name, values in outputs.items()})
 

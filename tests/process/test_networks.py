@@ -27,9 +27,7 @@ EXAMPLES = ROOT / "examples" / "networks"
 LESS = {
     "flights = 40\nstates = 30\nduration_s = 45.0": "flights = 2\nstates = 4\nduration_s = 4.0",
     "epochs = 10\nbatch": "epochs = 1\nbatch",
-    "rounds = 2\nflights = 40\nduration_s = 60.0\nepochs = 3": (
-        "rounds = 1\nflights = 1\nduration_s = 4.0\nepochs = 1"
-    ),
+    "rounds = 2\nflights = 40\nduration_s = 60.0\nepochs = 3": "rounds = 0",
     "worlds = 10\nevery_epochs = 10": (
         'worlds = 1\nset_ups = ["n5"]\nduration_s = 4.0\nmission_s = 4.0\nevery_epochs = 10'
     ),
