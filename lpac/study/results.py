@@ -8,8 +8,8 @@ Costs are normalised by the world's initial cost with all robots. Definitions:
   and to the best of ten runs of Lloyd's algorithm on the true density. Neither is a bound. Over all
   worlds they are ratios of means, else world by world.
 - A world **fails** if it ends above `FAILS_ABOVE` x clairvoyant. Costs **rise again** if they end
-  more than 5 % above their own minimum. The **worst rise** is the largest share, at any time, by
-  which a cost is above its best before.
+  more than 5 % above their own minimum. The **worst rise** is the largest share, from 60 s
+  on, by which a cost is above its best before.
 - Where robots are lost in flight, baselines and Lloyd's algorithm never had them.
 """
 
@@ -72,10 +72,9 @@ class MethodResult:
 
     @property
     def worst_rise(self) -> F64:
-        """(S, K): the largest share by which the cost rises above its best before."""
-        since = self.curves[..., self.time_s >= self.lost_at_s]
-        rise: F64 = (since / np.minimum.accumulate(since, axis=-1)).max(axis=-1) - 1.0
-        return rise
+        """(S, K); after the loss of robots, if there is one."""
+        since = self.time_s >= self.lost_at_s
+        return worst_rise(self.time_s[since], self.curves[..., since])
 
     @property
     def area(self) -> F64:
@@ -110,6 +109,17 @@ def over_mission(time_s: F64, curves: F64) -> F64:
     """Costs (..., M) of `curves` (..., C) at `time_s` (C,), at the M of `mission_times_s`."""
     at_s = np.array(mission_times_s(float(time_s[-1])))
     return curves[..., np.searchsorted(time_s, at_s + _ROUNDING_S) - 1]
+
+
+def worst_rise(time_s: F64, curves: F64) -> F64:
+    """Largest share (...) by which `curves` (..., C) rise above their best before.
+
+    It counts from 60 s on: while robots explore, costs may rise.
+    """
+    rise = curves / np.minimum.accumulate(curves, axis=-1)
+    counts = time_s >= mission_times_s(float(time_s[-1]))[0] - _ROUNDING_S
+    worst: F64 = rise[..., counts].max(axis=-1) - 1.0
+    return worst
 
 
 def results_of(

@@ -59,7 +59,7 @@ LEGEND = (
     "by world, p90\n"
     "vs best Lloyd: ratio to the best of ten such runs, in each world\n"
     "over the mission: mean cost at that time, and in brackets over the clairvoyant's then; rise: "
-    "how far a cost rises above its best before, on average over the worlds and in the worst\n"
+    "how far a cost rises above its best before, from 60 s on: mean over the worlds, and worst\n"
     f"{VERDICT_RULE}; otherwise they are not distinguishable"
 )
 

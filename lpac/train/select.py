@@ -16,7 +16,7 @@ from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Pool
 from lpac.sim.kept import KeptOutcomes
 from lpac.study.flights import CostCurve, KeptFlights, PlannedFlight
-from lpac.study.results import mission_times_s, over_mission
+from lpac.study.results import mission_times_s, over_mission, worst_rise
 from lpac.study.study import Condition, Method, Study, TrainedBundle
 from lpac.study.worlds import SET_UPS
 from lpac.train.config import SelectConfig
@@ -207,7 +207,10 @@ class Selection:
 def _mission_cost(curves: Sequence[CostCurve]) -> MissionCost:
     costs = np.array([curve.cost for curve in curves])
     costs /= costs[:, :1]
-    at = over_mission(np.array(curves[0].time_s), costs)
-    rise = costs / np.minimum.accumulate(costs, axis=1)
-    times_s = mission_times_s(curves[0].time_s[-1])
-    return MissionCost(times_s, tuple(at.mean(axis=0).tolist()), float(rise.max()) - 1.0)
+    time_s = np.array(curves[0].time_s)
+    at = over_mission(time_s, costs)
+    return MissionCost(
+        mission_times_s(curves[0].time_s[-1]),
+        tuple(at.mean(axis=0).tolist()),
+        float(worst_rise(time_s, costs).max()),
+    )

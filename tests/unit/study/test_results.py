@@ -106,6 +106,11 @@ def test_costs_of_a_long_flight_are_at_three_times_and_rises_count_from_the_best
     long = replace(RESULTS[PLAIN][0], time_s=time_s, curves=costs[None, None])
     assert long.worst_rise.tolist() == [[pytest.approx(1.0)]]
     assert replace(long, lost_at_s=130.0).worst_rise[0, 0] == pytest.approx(0.0)
+    # While robots explore, costs may rise.
+    early = replace(
+        long, curves=np.interp(time_s, [0, 20, 40, 60], [1.0, 0.5, 0.9, 0.4])[None, None]
+    )
+    assert early.worst_rise[0, 0] == pytest.approx(0.0)
 
 
 def test_lost_robots_are_held_against_those_who_never_had_them() -> None:
