@@ -55,8 +55,8 @@ class ClosedLoopCost(NamedTuple):
 class MissionCost(NamedTuple):
     """Mean cost over initial cost at `times_s`, and the worst rise above the best before."""
 
-    times_s: tuple[float, ...]
-    mean: tuple[float, ...]
+    times_s: list[float]
+    mean: list[float]
     worst_rise: float
 
 
@@ -210,7 +210,7 @@ def _mission_cost(curves: Sequence[CostCurve]) -> MissionCost:
     time_s = np.array(curves[0].time_s)
     at = over_mission(time_s, costs)
     return MissionCost(
-        mission_times_s(curves[0].time_s[-1]),
-        tuple(at.mean(axis=0).tolist()),
+        list(mission_times_s(curves[0].time_s[-1])),
+        at.mean(axis=0).tolist(),
         float(worst_rise(time_s, costs).max()),
     )
