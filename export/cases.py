@@ -17,6 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from edge.core import F32
+from edge.policy.graph import Shape
+from edge.policy.network.manifest import step_outputs
 from export.contract import (
     PER_NEIGHBOUR,
     Arrays,
@@ -140,7 +142,7 @@ class _Swarm:
         }
         if maps:
             [drawn["maps"]] = flight_images(len(maps.channels), maps.size, 1, self._random)
-        outputs = {"features": self._contract.features}
+        outputs: dict[str, Shape] = {"features": self._contract.features}
         return self._case("encode", self._contract.encode, drawn, outputs)
 
     def _stepped(self, features: F32, messages: F32, memory: F32) -> Case:
@@ -154,14 +156,15 @@ class _Swarm:
             "degree": np.array(count),
             "memory": memory,
         }
-        return self._case("step", self._contract.step, drawn, self._contract.step_outputs)
+        outputs = step_outputs(self._contract.message_size, self._contract.memory_size)
+        return self._case("step", self._contract.step, drawn, outputs)
 
     def _case(
         self,
         function: str,
         names: Iterable[str],
         drawn: Mapping[str, npt.NDArray[Any]],
-        shapes: Mapping[str, tuple[int, ...]],
+        shapes: Mapping[str, Shape],
     ) -> Case:
         inputs = {name: drawn[name].astype(np.float32) for name in names}
         outputs = self._run(function, inputs, shapes)
@@ -175,9 +178,7 @@ class _Swarm:
             self._check_order(function, inputs, outputs)
         return Case(inputs, {name: values.float().numpy() for name, values in outputs.items()})
 
-    def _run(
-        self, function: str, inputs: Arrays, shapes: Mapping[str, tuple[int, ...]]
-    ) -> dict[str, Tensor]:
+    def _run(self, function: str, inputs: Arrays, shapes: Mapping[str, Shape]) -> dict[str, Tensor]:
         results = call(self._module, function, inputs, self._dtype)
         if [tuple(result.shape) for result in results] != list(shapes.values()):
             found = ", ".join(str(tuple(result.shape)) for result in results)
@@ -193,7 +194,7 @@ class _Swarm:
             name: np.roll(values[::-1], 1, axis=0).copy() if name in PER_NEIGHBOUR else values
             for name, values in inputs.items()
         }
-        shapes = {name: tuple(values.shape) for name, values in outputs.items()}
+        shapes: dict[str, Shape] = {name: tuple(values.shape) for name, values in outputs.items()}
         for name, values in self._run(function, reordered, shapes).items():
             former = outputs[name]
             change = float((values - former).abs().sum())

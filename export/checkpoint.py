@@ -229,6 +229,13 @@ def read_state_dict(path: Path) -> dict[str, torch.Tensor]:
     return _tensors(path, _read_bytes(path))
 
 
+def write_state_dict(state: Mapping[str, torch.Tensor]) -> bytes:
+    """Content of a state dict's file, for `torch.load`."""
+    buffer = io.BytesIO()
+    torch.save({name: tensor.detach().cpu() for name, tensor in state.items()}, buffer)
+    return buffer.getvalue()
+
+
 def parse_state_dict(content: bytes, name: str) -> dict[str, torch.Tensor]:
     """Like `read_state_dict` for a file's content; `name` stands for the file in errors."""
     return _tensors(Path(name), content)

@@ -81,12 +81,6 @@ class Contract:
             rates,
         )
 
-    @property
-    def step_outputs(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the outputs of `step`, in order."""
-        outputs: dict[str, tuple[int, ...]] = {"action": (2,), "message": (self.message_size,)}
-        return outputs | ({"new_memory": (self.memory_size,)} if self.memory_size else {})
-
 
 def _size(module: nn.Module, name: str, default: int | None = None) -> int:
     size = getattr(module, name, default)

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from edge.core.perception import PerceptionParameters
 from edge.policy.bundle import (
+    LPAC,
     SCHEMA_VERSION,
     Bundle,
     BundleError,
@@ -137,6 +139,33 @@ def _with_cnn(network: Checkpoint, other: Checkpoint, path: Path) -> Checkpoint:
     return replace(network, cnn=other.cnn)
 
 
+def manifest_of(
+    family: str,
+    perception: PerceptionParameters | None,
+    trained: PolicyParameters,
+    name: str,
+    provenance: Mapping[str, str],
+    parameters: dict[str, object],
+) -> Manifest:
+    """Manifest of a policy that this exporter made; `make_bundle` adds the files."""
+    return Manifest(
+        schema=SCHEMA_VERSION,
+        name=name,
+        family=family,
+        perception=perception,
+        training=trained.training,
+        payload_limit=trained.messages.payload_limit,
+        payload_types=trained.messages.payload_types,
+        provenance={
+            **provenance,
+            "exporter": f"lpac-edge {version('lpac-edge')}",
+            "torch": torch.__version__,
+        },
+        files={},
+        parameters=parameters,
+    )
+
+
 def bundle_of(
     network: Checkpoint, trained: PolicyParameters, name: str, provenance: Mapping[str, str]
 ) -> Bundle:
@@ -154,21 +183,8 @@ def bundle_of(
             len(network.cnn.linear.bias),
         )
         perception = replace(trained.perception, unseen_as_nan=EXPLORED in images.channels)
-    manifest = Manifest(
-        schema=SCHEMA_VERSION,
-        name=name,
-        perception=perception,
-        training=trained.training,
-        payload_limit=trained.messages.payload_limit,
-        payload_types=trained.messages.payload_types,
-        provenance={
-            **provenance,
-            "exporter": f"lpac-edge {version('lpac-edge')}",
-            "torch": torch.__version__,
-        },
-        files={},  # filled in by make_bundle
-        parameters=LpacManifest(OPSET, network.geometry, images).parameters,
-    )
+    parameters = LpacManifest(OPSET, network.geometry, images).parameters
+    manifest = manifest_of(LPAC, perception, trained, name, provenance, parameters)
     bundle = make_bundle(manifest, files)
     for check in LpacPolicy(bundle).verify():
         if not check.passed:

@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
-from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from edge.policy.bundle import SCHEMA_VERSION, Bundle, BundleError, Manifest, make_bundle
+from edge.policy.bundle import Bundle, BundleError, make_bundle
 from edge.policy.family import TOLERANCE
 from edge.policy.golden import GOLDEN
 from edge.policy.graph import Graph
@@ -36,6 +35,7 @@ from edge.policy.network.policy import NetworkPolicy
 from export.cases import COUNTS, Case, golden_cases
 from export.checkpoint import CheckpointError, read_state_dict
 from export.contract import PER_NEIGHBOUR, Contract, ModuleError, with_neighbours
+from export.exporter import manifest_of
 from export.parameters import PolicyParameters, read_parameters
 
 _OPSET = 20
@@ -55,22 +55,19 @@ def export_module(
     default the class's. Raises ModuleError, CheckpointError or ConfigError, one line each.
     """
     trained = read_parameters(parameters)
-    module = load_module(reference, checkpoint)
-    contract = Contract.of(module.eval())
-    if (
-        golden_cases(load_module(reference, checkpoint).eval(), contract, trained).file()
-        != golden_cases(module, contract, trained).file()
-    ):
-        raise ModuleError(
-            f"{reference}: its constructor draws numbers that the checkpoint does not have: "
-            "register them as a persistent buffer before training"
-        )
+    module, again = load_module(reference, checkpoint), load_module(reference, checkpoint).eval()
     provenance = {"module": reference.rpartition("/")[2]}
     for source, path in (("checkpoint", checkpoint), ("parameters", parameters)):
         if path is not None:
             provenance[source] = path.name
             provenance[f"{source}_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return network_bundle(module, trained, name or type(module).__name__, provenance)
+    bundle = network_bundle(module, trained, name or type(module).__name__, provenance)
+    if golden_cases(again, Contract.of(again), trained).file() != bundle.files[GOLDEN]:
+        raise ModuleError(
+            f"{reference}: its constructor draws numbers that the checkpoint does not have: "
+            "register them as a persistent buffer before training"
+        )
+    return bundle
 
 
 def load_module(reference: str, checkpoint: Path | None) -> nn.Module:
@@ -165,22 +162,8 @@ def network_bundle(
         order="by robot id" if contract.depends_on_order else "any",
     )
     explores = contract.maps is not None and EXPLORED in contract.maps.channels
-    manifest = Manifest(
-        schema=SCHEMA_VERSION,
-        name=name,
-        family=NETWORK,
-        perception=replace(trained.perception, unseen_as_nan=explores),
-        training=trained.training,
-        payload_limit=trained.messages.payload_limit,
-        payload_types=trained.messages.payload_types,
-        provenance={
-            **provenance,
-            "exporter": f"lpac-edge {version('lpac-edge')}",
-            "torch": torch.__version__,
-        },
-        files={},  # filled in by make_bundle
-        parameters=network.parameters,
-    )
+    perception = replace(trained.perception, unseen_as_nan=explores)
+    manifest = manifest_of(NETWORK, perception, trained, name, provenance, network.parameters)
     files = {**graphs, GOLDEN: cases.file()}
     try:
         policy = NetworkPolicy(make_bundle(manifest, files))

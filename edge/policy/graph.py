@@ -28,7 +28,7 @@ class Graph:
         # The board also runs the autopilot: no thread pool, no spinning.
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
-        # Its errors are raised, too.
+        # Errors are raised; printed as well, they would hide the one line for people.
         options.log_severity_level = 4
         # The arena would keep the memory of the largest batch, that of verification: 4.5 MB.
         options.enable_cpu_mem_arena = False

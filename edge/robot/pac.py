@@ -278,13 +278,11 @@ class Pac:
         near = neighbours_in_range(own, positions, self._perception.communication_range)
         near, kept_near = near[: len(received)], near[len(received) :]
         used = [each for each, is_near in zip(received, near, strict=True) if is_near]
-        velocities_m_s = [each.beacon.velocity_m_s or (0.0, 0.0, 0.0) for each in used]
-        neighbours = Neighbourhood(
-            robot_ids=tuple(each.beacon.robot_id for each in used),
-            payloads=tuple(each.message.payload for each in used),
-            positions=(positions[: len(received)][near] - own).astype(np.float32),
-            velocities=self._velocities(velocities_m_s).astype(np.float32),
-            ages_s=np.array([now_s - each.sent_at_s for each in used], np.float32),
+        neighbours = neighbourhood(
+            used,
+            positions[: len(received)][near] - own,
+            self._parameters.scale,
+            now_s,
             degree=max(int(kept_near.sum()), int(near.sum())),
         )
         step = self._step(features.value, neighbours)
@@ -406,13 +404,28 @@ class Pac:
         horizontal = np.array(positions_m, np.float64).reshape(-1, 3)[:, :2]
         return self._parameters.scale.position_to_model(horizontal)
 
-    def _velocities(self, velocities_m_s: Sequence[Position]) -> F64:
-        """Horizontal velocities (n, 2) in model units/s."""
-        horizontal = np.array(velocities_m_s, np.float64).reshape(-1, 3)[:, :2]
-        return self._parameters.scale.velocity_to_model(horizontal)
-
     def _is_old(self, timed: _Timed[Any], now_s: float) -> bool:
         return now_s - timed.time_s > self._parameters.max_input_age_s
+
+
+def neighbourhood(
+    received: Sequence[ReceivedMessage],
+    positions: F64,
+    scale: ModelScale,
+    now_s: float,
+    degree: int,
+) -> Neighbourhood:
+    """The messages that a step uses, their senders' relative `positions` (n, 2), model units."""
+    velocities_m_s = [each.beacon.velocity_m_s or (0.0, 0.0, 0.0) for each in received]
+    horizontal = np.array(velocities_m_s, np.float64).reshape(-1, 3)[:, :2]
+    return Neighbourhood(
+        robot_ids=tuple(each.beacon.robot_id for each in received),
+        payloads=tuple(each.message.payload for each in received),
+        positions=positions.astype(np.float32),
+        velocities=scale.velocity_to_model(horizontal).astype(np.float32),
+        ages_s=np.array([now_s - each.sent_at_s for each in received], np.float32),
+        degree=degree,
+    )
 
 
 def _position_m(received: ReceivedMessage) -> Position:

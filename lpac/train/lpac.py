@@ -4,7 +4,6 @@ The state dict has the tensors and names of CoverageControl's LPAC module, which
 network has the four maps and every convolution has as many channels as the CNN has features.
 """
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -27,6 +26,7 @@ from export.checkpoint import (
     POSITION_SIZE,
     checkpoint_tensors,
     parse_checkpoint,
+    write_state_dict,
 )
 from export.exporter import bundle_of
 from export.parameters import PolicyParameters
@@ -137,9 +137,7 @@ class LpacNetwork(Bounded):
 
     def checkpoint(self, state: StateDict) -> bytes:
         """See `Learnable`; a file for `torch.load`."""
-        buffer = io.BytesIO()
-        torch.save({name: tensor.detach().cpu() for name, tensor in state.items()}, buffer)
-        return buffer.getvalue()
+        return write_state_dict(state)
 
     def bundle(
         self,

@@ -5,7 +5,6 @@ With a function `loss(inputs, shift, present, velocities)` it is trained by that
 squared error of the velocities. Buffers `actions_mean` and `actions_std` get those of the expert.
 """
 
-import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -15,7 +14,7 @@ from torch import nn
 from edge.core import F32
 from edge.core.schema import Bounded, ConfigError, from_mapping
 from edge.policy.bundle import Bundle
-from export.checkpoint import parse_state_dict
+from export.checkpoint import parse_state_dict, write_state_dict
 from export.contract import PER_NEIGHBOUR, Contract
 from export.module import load_class, network_bundle
 from export.parameters import PolicyParameters
@@ -70,9 +69,7 @@ class ModuleNetwork:
 
     def checkpoint(self, state: StateDict) -> bytes:
         """See `Learnable`; a file for `torch.load`."""
-        buffer = io.BytesIO()
-        torch.save({name: tensor.detach().cpu() for name, tensor in state.items()}, buffer)
-        return buffer.getvalue()
+        return write_state_dict(state)
 
     def bundle(
         self,

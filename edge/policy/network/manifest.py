@@ -118,9 +118,8 @@ class NetworkManifest(Bounded):
 
     @property
     def step_outputs(self) -> dict[str, Shape]:
-        """Shapes of the outputs of `step`; a network without memory has no output for it."""
-        outputs: dict[str, Shape] = {"action": self.action.shape, "message": (self.message_size,)}
-        return outputs | ({"new_memory": (self.memory_size,)} if self.memory_size else {})
+        """Shapes of the outputs of `step`."""
+        return step_outputs(self.message_size, self.memory_size)
 
     @property
     def parameters(self) -> dict[str, object]:
@@ -165,6 +164,12 @@ def step_inputs(features: Shape, message_size: int, memory_size: int) -> dict[st
         "degree": Array((), "robots"),
         "memory": Array((memory_size,), "step"),
     }
+
+
+def step_outputs(message_size: int, memory_size: int) -> dict[str, Shape]:
+    """Shapes of the outputs of `step`; a network without memory has no output for it."""
+    outputs: dict[str, Shape] = {"action": _ACTION.shape, "message": (message_size,)}
+    return outputs | ({"new_memory": (memory_size,)} if memory_size else {})
 
 
 def _expected(name: str, known: Mapping[str, Array]) -> str:

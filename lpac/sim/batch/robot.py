@@ -23,7 +23,7 @@ from edge.flight.safety import limit_speed
 from edge.messages.beacon import Beacon
 from edge.policy.family import Neighbourhood, Observation
 from edge.robot.neighbours import NeighbourTable, Number
-from edge.robot.pac import PacParameters
+from edge.robot.pac import PacParameters, neighbourhood
 from lpac.sim.batch.agents import Agents, Inputs, PolicyFailedError
 from lpac.sim.batch.seen import SeenMap, ShownWorld
 
@@ -244,16 +244,8 @@ class BatchedRobot:
             degree = max(degree, int(self._in_range(own, [each.beacon for each in kept]).sum()))
         used = [each for each, is_near in zip(received, near.tolist(), strict=True) if is_near]
         steps = tuple(message.step for _, message, _ in used if isinstance(message, _Deferred))
-        velocities_m_s = [each.beacon.velocity_m_s or (0.0, 0.0, 0.0) for each in used]
-        horizontal = np.array(velocities_m_s, np.float64).reshape(-1, 3)[:, :2]
-        neighbours = Neighbourhood(
-            robot_ids=tuple(each.beacon.robot_id for each in used),
-            payloads=tuple(step.payload for step in steps),
-            positions=(positions[near] - own).astype(np.float32),
-            velocities=self._parameters.scale.velocity_to_model(horizontal).astype(np.float32),
-            ages_s=np.array([now_s - each.sent_at_s for each in used], np.float32),
-            degree=degree,
-        )
+        scale = self._parameters.scale
+        neighbours = neighbourhood(used, positions[near] - own, scale, now_s, degree)
         before = (*steps, self._action) if self._action else steps
         step = DeferredStep(
             self,
